@@ -1,0 +1,76 @@
+"""The servo's world in real time: cyclic bus, serial port and the host's clock, waited on together.
+
+Times are CLOCK_MONOTONIC_RAW: not slewed by NTP, so a line's arrival and a cycle's start are on one straight clock.
+"""
+
+import select
+import time
+
+from drivers.can_bus import ERROR_FLAG, CyclicBus
+from drivers.serial_port import SerialPort
+from drivers.wire import Inbox
+from stagectl.errors import LinkError
+
+_CHUNK_LIMIT_BYTES = 512  # what one row can hold; the rest comes with the next cycle
+_BUS_OFF = 0x40  # linux/can/error.h
+
+
+def now_t_ns() -> int:
+    """Return the host clock of stamps and deadlines, ns."""
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+
+
+class RealtimeTransport:
+    """Waits for the next cycle and stamps what arrives meanwhile; LinkError where bus or port is gone."""
+
+    def __init__(self, bus: CyclicBus, port: SerialPort, names: dict[int, str]):
+        """Take over bus and port; `names` gives the inbox slot of each CAN id."""
+        self._bus, self._port, self._names = bus, port, names
+        self._poll = select.poll()
+        self._poll.register(port.fileno(), select.POLLIN)
+        self.error_frames_count = 0
+
+    @property
+    def lost_count(self) -> int:
+        """Frames that the bus did not take."""
+        return self._bus.lost_count
+
+    def now_t_ns(self) -> int:
+        """Return the host clock."""
+        return now_t_ns()
+
+    def receive(self, deadline_t_ns: int, inbox: Inbox) -> int:
+        """Wait until the deadline, stamping sensor bytes as they become readable; then take the bus's frames."""
+        while (left_ns := deadline_t_ns - now_t_ns()) > 0:
+            if len(inbox.sensor_bytes) >= _CHUNK_LIMIT_BYTES:
+                time.sleep(left_ns * 1e-9)
+            elif self._poll.poll(left_ns * 1e-6):
+                inbox.sensor_arrival_t_ns = now_t_ns()
+                self._read(inbox)
+        if len(inbox.sensor_bytes) < _CHUNK_LIMIT_BYTES and self._poll.poll(0):
+            inbox.sensor_arrival_t_ns = now_t_ns()
+            self._read(inbox)
+        while (frame := self._bus.receive()) is not None:
+            can_id, payload = frame
+            if can_id & ERROR_FLAG:
+                self.error_frames_count += 1
+                if can_id & _BUS_OFF:
+                    raise LinkError("CAN controller is bus-off: check cable, termination and bit rate, then arm again")
+                continue
+            setattr(inbox, self._names[can_id], payload)
+        return now_t_ns()
+
+    def _read(self, inbox: Inbox) -> None:
+        inbox.sensor_bytes += self._port.read(_CHUNK_LIMIT_BYTES - len(inbox.sensor_bytes))
+
+    def send(self, frames: list[tuple[int, bytes]]) -> tuple[bool, int]:
+        """Queue frames in this order; a full queue is a missed command, never sent again."""
+        sent = True
+        for can_id, payload in frames:
+            sent &= self._bus.send(can_id, payload)
+        return sent, now_t_ns()
+
+    def close(self) -> None:
+        """Close both."""
+        self._bus.close()
+        self._port.close()

@@ -1,0 +1,266 @@
+"""One cycle's bytes and frames to a MEASUREMENT, and a COMMAND to frames; the same live and in replay.
+
+`Inbox` is what came in, untouched. `WireDecoder` holds all memory that decoding needs (framer, sample clock, zeros,
+last process data) and reads no clock: times come with the inbox. Pure; opens nothing.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers import cia402, sample_clock
+from drivers.air import ciddor_index
+from drivers.arming import SYNC_ID, DriveMapping
+from drivers.framers import framer_for
+from drivers.reading import END_VALID, MACRO_VALID, REFERENCE_LOST, RESTARTED, Reading
+from drivers.scale import counts_per_wavelength_of, metres_per_count
+
+SERVO_NODE_ID = 0x7E
+HEARTBEAT_FRAME = (0x700 + SERVO_NODE_ID, b"\x05")
+SYNC_FRAME = (SYNC_ID, b"")
+
+BOTH_VALID = MACRO_VALID | END_VALID
+_EARLIEST_SHARE = 0.5  # of the transport's constant part: no line of a sample younger than this can be there
+
+
+@dataclass(slots=True)
+class Inbox:
+    """What one cycle received."""
+
+    t_ns: int = 0
+    sensor_bytes: bytes = b""
+    sensor_arrival_t_ns: int = 0
+    macro_tpdo: bytes | None = None
+    micro_tpdo: bytes | None = None
+    macro_inputs_tpdo: bytes | None = None
+    micro_inputs_tpdo: bytes | None = None
+    macro_emcy: bytes | None = None
+    micro_emcy: bytes | None = None
+
+    FRAMES = ("macro_tpdo", "micro_tpdo", "macro_inputs_tpdo", "micro_inputs_tpdo", "macro_emcy", "micro_emcy")
+
+    def clear(self) -> None:
+        """Forget the cycle before."""
+        self.sensor_bytes = b""
+        self.macro_tpdo = self.micro_tpdo = None
+        self.macro_inputs_tpdo = self.micro_inputs_tpdo = None
+        self.macro_emcy = self.micro_emcy = None
+
+
+def frame_names(mappings: Mapping[str, DriveMapping]) -> dict[int, str]:
+    """Return the inbox slot of every CAN id that the servo listens to."""
+    names = {}
+    for axis, mapping in mappings.items():
+        names[mapping.tpdo_id] = f"{axis}_tpdo"
+        names[mapping.inputs_id] = f"{axis}_inputs_tpdo"
+        names[mapping.emcy_id] = f"{axis}_emcy"
+    return names
+
+
+class WireDecoder:
+    """Everything that turns an inbox into a measurement; `snapshot` and `restore` make replay start anywhere."""
+
+    def __init__(self, profile, mappings: Mapping[str, DriveMapping]):
+        """Build framer, clock and scales from a profile (attributes named as in a profile file)."""
+        sensor = profile.interferometer
+        table = sensor.model_dump()
+        self.framer = framer_for(table)
+        self.mappings = dict(mappings)
+        self.period_ns = 1e9 / sensor.rate_hz
+        self.clock = sample_clock.init(self.period_ns, sensor.transport_s * 1e9)
+        air = profile.air
+        self.air_index = ciddor_index(
+            air.wavelength_vacuum_m, air.temperature_degc, air.pressure_pa, air.relative_humidity_percent, air.co2_ppm
+        )
+        macro_counts, end_counts = counts_per_wavelength_of(table)
+        self.macro_m_per_count = metres_per_count(air.wavelength_vacuum_m, self.air_index, macro_counts)
+        self.end_m_per_count = metres_per_count(air.wavelength_vacuum_m, self.air_index, end_counts)
+        self.macro_zero_counts = math.nan
+        self.end_zero_counts = math.nan
+        self.macro_counts = math.nan
+        self.end_counts = math.nan
+        self.sequence = -1
+        self.cycle = -1
+        self.reference_lost = 0
+        self.encoder_trusted = False  # only after a homing do laser and encoder share a zero
+        self.samples_lost = 0
+        self._compared_sequence = -2
+        self._compared_m = 0.0
+        self._sync_share = profile.cycle.actuation_delay_s * sensor.rate_hz
+        self._earliest_ns = _EARLIEST_SHARE * sensor.transport_s * 1e9
+        self._jump_m = sensor.jump_limit_m
+        self._disagreement_m = sensor.encoder_disagreement_m
+        self._incremental = sensor.incremental
+        self._single = profile.micro is None
+        self._axes = {}
+        for axis, settings in (("macro", profile.macro), ("micro", profile.micro)):
+            if settings is not None and axis in self.mappings:
+                codec = self.mappings[axis].tpdo
+                self._axes[axis] = (
+                    codec,
+                    codec.slot("statusword"),
+                    codec.slot("position"),
+                    codec.slot("torque"),
+                    settings.encoder_step_m or 0.0,
+                    settings.rated_force_n * 1e-3,
+                    1 if axis == "macro" else 2,
+                    self.mappings[axis].node_id,
+                )
+
+    def _take_reading(self, reading: Reading) -> bool:
+        """Take one reading; returns whether it is a valid sample of both axes."""
+        if reading.flags & REFERENCE_LOST:
+            self.reference_lost = 1
+        wanted = MACRO_VALID if self._single else BOTH_VALID
+        if reading.flags & wanted != wanted:
+            return False
+        if self.sequence >= 0 and not reading.flags & RESTARTED:
+            elapsed = reading.sequence - self.sequence
+            if elapsed <= 0:
+                return False
+            self.samples_lost += elapsed - 1
+            reach_m = self._jump_m * elapsed
+            if self._incremental and not (
+                abs(reading.macro_counts - self.macro_counts) * self.macro_m_per_count <= reach_m
+                and (self._single or abs(reading.end_counts - self.end_counts) * self.end_m_per_count <= reach_m)
+            ):
+                self.reference_lost = 1
+        self.sequence = reading.sequence
+        self.macro_counts = reading.macro_counts
+        self.end_counts = reading.macro_counts if self._single else reading.end_counts
+        if math.isnan(self.macro_zero_counts):  # until homed, positions count from the first sample
+            self.macro_zero_counts = self.macro_counts
+            self.end_zero_counts = self.end_counts
+        return True
+
+    def _take_frames(self, inbox: Inbox, m: np.ndarray) -> None:
+        """Decode process data, inputs and emergencies; LinkError on a short PDO, nothing of it taken."""
+        fresh = 0
+        for axis, (codec, status, position, torque, step_m, force_n, bit, node_id) in self._axes.items():
+            payload = inbox.macro_tpdo if bit == 1 else inbox.micro_tpdo
+            if payload is not None:
+                values = codec.decode(payload)
+                m[f"{axis}_statusword"][0] = values[status]
+                m[f"{axis}_encoder_m"][0] = values[position] * step_m
+                m[f"{axis}_reported_force_n"][0] = values[torque] * force_n
+                fresh |= bit
+            payload = inbox.macro_inputs_tpdo if bit == 1 else inbox.micro_inputs_tpdo
+            if payload is not None:
+                m[f"{axis}_digital_inputs"][0] = self.mappings[axis].inputs_tpdo.decode(payload)[0]
+            payload = inbox.macro_emcy if bit == 1 else inbox.micro_emcy
+            if payload is not None:
+                code = cia402.decode_emergency(payload)[0]
+                m["emergency"][0] = node_id << 16 | code if code else 0
+        m["tpdos_new"][0] = fresh
+
+    def decode(self, inbox: Inbox, m: np.ndarray) -> None:
+        """Write what the inbox says into a MEASUREMENT; lease, overrun and lost commands are the caller's."""
+        valid = 0
+        if inbox.sensor_bytes:
+            for reading in self.framer.feed(inbox.sensor_bytes):
+                sample_clock.step(self.clock, reading.sequence, inbox.sensor_arrival_t_ns)
+                if reading.flags & RESTARTED:
+                    self.cycle = -1
+                valid += self._take_reading(reading)
+        self._take_frames(inbox, m)
+        m["t_ns"][0] = inbox.t_ns
+        m["samples_new"][0] = valid
+        m["sequence"][0] = self.sequence
+        if self.sequence >= 0:
+            age_ns = sample_clock.sample_age_ns(self.clock, self.sequence, inbox.t_ns)
+            due = self.sequence + math.floor((age_ns - self._earliest_ns) / self.period_ns)
+            self.cycle = max(due, self.cycle + 1 if valid and self.cycle < 0 else self.cycle, self.sequence)
+            m["sample_t_ns"][0] = sample_clock.sample_t_ns(self.clock, self.sequence)
+            m["macro_position_m"][0] = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
+            m["end_position_m"][0] = (self.end_counts - self.end_zero_counts) * self.end_m_per_count
+            if valid:
+                self._compare_with_encoder(m)
+        m["cycle"][0] = self.cycle
+        m["reference_lost"][0] = self.reference_lost
+
+    def _compare_with_encoder(self, m: np.ndarray) -> None:
+        """Latch *reference lost* where laser and drive disagree, both at the instant of the last SYNC.
+
+        The drive sampled its encoder between the last two laser samples: at 0.2 m/s that is 90 um away.
+        """
+        macro_m = float(m["macro_position_m"][0])
+        if self.encoder_trusted and self.sequence == self._compared_sequence + 1 and m["tpdos_new"][0] & 1:
+            laser_m = self._compared_m + self._sync_share * (macro_m - self._compared_m)
+            if not abs(laser_m - float(m["macro_encoder_m"][0])) <= self._disagreement_m:
+                self.reference_lost = 1
+        self._compared_sequence = self.sequence
+        self._compared_m = macro_m
+
+    def set_zeros(self, macro_zero_counts: float, end_zero_counts: float) -> tuple[float, float]:
+        """Take new laser zeros (a homing); returns by how much all macro and end positions moved, in m."""
+        macro_shift_m = (self.macro_zero_counts - macro_zero_counts) * self.macro_m_per_count
+        end_shift_m = (self.end_zero_counts - end_zero_counts) * self.end_m_per_count
+        self.macro_zero_counts = macro_zero_counts
+        self.end_zero_counts = end_zero_counts
+        self.reference_lost = 0
+        self.encoder_trusted = True
+        self._compared_sequence = -2
+        return macro_shift_m, end_shift_m
+
+    def next_start_t_ns(self, phase_ns: float) -> int:
+        """Return when the next cycle should start: its sample's instant plus the phase; 0 before the first sample."""
+        if self.sequence < 0:
+            return 0
+        return int(sample_clock.sample_t_ns(self.clock, self.cycle + 1)) + int(phase_ns)
+
+    _PLAIN = (
+        "macro_zero_counts",
+        "end_zero_counts",
+        "macro_counts",
+        "end_counts",
+        "sequence",
+        "cycle",
+        "reference_lost",
+        "encoder_trusted",
+        "samples_lost",
+        "_compared_sequence",
+        "_compared_m",
+    )
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Copy all memory as arrays for a run's snapshot."""
+        values = {name: getattr(self, name) for name in self._PLAIN}
+        return {
+            "decoder_values": np.frombuffer(json.dumps(values).encode(), np.uint8).copy(),
+            "decoder_framer": np.frombuffer(self.framer.snapshot(), np.uint8).copy(),
+            "decoder_clock": self.clock.copy(),
+        }
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Go on from where `snapshot` was taken."""
+        for name, value in json.loads(bytes(snapshot["decoder_values"])).items():
+            setattr(self, name, value)
+        self.framer.restore(bytes(snapshot["decoder_framer"]))
+        self.clock[...] = snapshot["decoder_clock"]
+
+
+class WireEncoder:
+    """A command and two controlwords to the frames of a cycle: micro first, then macro; SYNC is the caller's."""
+
+    def __init__(self, profile, mappings: Mapping[str, DriveMapping]):
+        """Take the RPDO codecs as read back from the drives."""
+        self._position_mode = profile.macro.mode == "position"
+        self._encoder_step_m = profile.macro.encoder_step_m
+        self._macro = mappings["macro"]
+        self._micro = mappings.get("micro")
+
+    def micro(self, controlword: int, word: int) -> tuple[int, bytes] | None:
+        """Return the micro's frame, None without a micro."""
+        if self._micro is None:
+            return None
+        return self._micro.rpdo_id, self._micro.rpdo.encode(controlword, word)
+
+    def macro(self, controlword: int, word: int, target_m: float) -> tuple[int, bytes]:
+        """Return the macro's frame: target torque, or position target and torque offset."""
+        if self._position_mode:
+            target = math.floor(target_m / self._encoder_step_m + 0.5)
+            return self._macro.rpdo_id, self._macro.rpdo.encode(controlword, target, word)
+        return self._macro.rpdo_id, self._macro.rpdo.encode(controlword, word)

@@ -1,0 +1,158 @@
+"""Where the axes are and what pushes them: an observer that runs the believed machine beside the real one.
+
+The believed machine is the same plant code as the simulator's, composed with the profile's effects. Between
+two samples it feels the integers that were sent: the old command until the SYNC that latches the new one, then
+the new one. A sample corrects position, velocity and an unknown force on each axis (a random walk), with the
+steady-state gains of the Kalman filter for that model. Prediction from the sample's instant to the instant the
+next command acts is the same code run ahead. Pure; knows no bus and no clock.
+"""
+
+import numpy as np
+
+from stagectl.compiled import compiled
+from stagectl.plant import PLANT_PARAMETERS, PLANT_STATE
+
+ESTIMATOR = np.dtype(
+    [
+        ("period_s", "f8"),
+        ("actuation_delay_s", "f8"),  # sample instant -> the SYNC that latches the command
+        ("longest_substep_s", "f8"),
+        ("predicted_samples_max", "f8"),
+        ("macro_amperes_per_word", "f8"),
+        ("micro_amperes_per_word", "f8"),
+        ("macro_position_gain_ratio", "f8"),
+        ("macro_velocity_gain_per_s", "f8"),
+        ("macro_force_gain_n_per_m", "f8"),
+        ("micro_position_gain_ratio", "f8"),
+        ("micro_velocity_gain_per_s", "f8"),
+        ("micro_force_gain_n_per_m", "f8"),
+        ("position_mode", "f8"),  # 1 where the macro's drive closes its own position loop (CSP with torque offset)
+        ("started", "f8"),
+        ("cycle", "f8"),  # of the last tick
+        ("predicted_samples", "f8"),  # in a row without a fresh sample
+        ("macro_word", "f8"),  # latched by the last SYNC
+        ("micro_word", "f8"),
+        ("macro_word_before", "f8"),  # latched by the SYNC before
+        ("micro_word_before", "f8"),
+        ("macro_innovation_m", "f8"),
+        ("end_innovation_m", "f8"),
+    ]
+)
+
+FREE_SUPPLY_V = 1e12  # a belief's current loop never runs out of voltage
+
+
+def belief(profile) -> np.ndarray:
+    """Make PLANT_PARAMETERS of what the profile believes (attributes named as in a profile)."""
+    q = np.zeros(1, PLANT_PARAMETERS)
+    macro, micro, backlash = profile.macro, profile.micro, profile.backlash
+    q["macro_mass_kg"] = macro.mass_kg
+    q["travel_low_m"], q["travel_high_m"] = -np.inf, np.inf
+    q["stroke_low_m"], q["stroke_high_m"] = -np.inf, np.inf
+    q["left_m"], q["right_m"] = np.inf, np.inf
+    q["micro_mass_kg"] = 1.0
+    for name, axis in (("macro", macro), ("micro", micro if micro is not None else macro)):
+        q[f"{name}_force_constant_n_per_a"] = axis.rated_force_n / axis.rated_current_a
+        q[f"{name}_current_loop_s"] = axis.current_loop_s
+        q[f"{name}_current_limit_a"] = axis.force_limit_n / axis.rated_force_n * axis.rated_current_a
+        q[f"{name}_resistance_ohm"] = 1.0
+        q[f"{name}_inductance_h"] = 1.0
+        q[f"{name}_supply_v"] = FREE_SUPPLY_V
+    if micro is not None:
+        q["has_micro"] = 1.0
+        q["micro_mass_kg"] = micro.mass_kg
+        q["spring_n_per_m"] = micro.spring_n_per_m
+        q["damping_n_s_per_m"] = micro.damping_n_s_per_m
+        for name in ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m"):
+            q[name] = getattr(backlash, name)
+    return q
+
+
+def kalman_gains(mass_kg: float, period_s: float, noise_m: float, drift_n_per_sqrt_s: float) -> np.ndarray:
+    """Return the steady-state gains on (position, velocity, unknown force) of a mass under a random-walk force.
+
+    Iterates the Riccati equation of x' = v, v' = w / m, w a random walk of the given density, with position
+    noise `noise_m` a sample (Kalman 1960; Anderson, Moore, Optimal Filtering, chapter 4).
+    """
+    h = period_s
+    a = np.array([[1.0, h, h * h / (2 * mass_kg)], [0.0, 1.0, h / mass_kg], [0.0, 0.0, 1.0]])
+    g = np.array([h**3 / (6 * mass_kg), h**2 / (2 * mass_kg), h])
+    noise = np.outer(g, g) / h * drift_n_per_sqrt_s**2
+    r = noise_m**2
+    # scaled so that all states are of order one; a fixed point is found well within these steps
+    scale = np.array([noise_m, noise_m / h, noise_m * mass_kg / h**2])
+    a = a * scale[None, :] / scale[:, None]
+    noise = noise / np.outer(scale, scale)
+    r = r / noise_m**2
+    p = np.eye(3)
+    gain = np.zeros(3)
+    for _ in range(20000):
+        p = a @ p @ a.T + noise
+        new_gain = p[:, 0] / (p[0, 0] + r)
+        p = p - np.outer(new_gain, p[0, :])
+        p = 0.5 * (p + p.T)
+        if np.max(np.abs(new_gain - gain)) < 1e-12 * np.max(np.abs(new_gain)):
+            break
+        gain = new_gain
+    return gain * scale / scale[0]
+
+
+def init(profile) -> np.ndarray:
+    """Make ESTIMATOR for a profile: gains from its noise and drift densities, nothing seen yet."""
+    e = np.zeros(1, ESTIMATOR)
+    period_s = 1.0 / profile.cycle.rate_hz
+    e["period_s"] = period_s
+    e["actuation_delay_s"] = profile.cycle.actuation_delay_s
+    e["longest_substep_s"] = 300e-6
+    e["predicted_samples_max"] = profile.cycle.predicted_samples_count
+    e["position_mode"] = float(profile.macro.mode == "position")
+    noise_m = profile.interferometer.noise_m
+    control = profile.control
+    e["macro_amperes_per_word"] = 1e-3 * profile.macro.rated_current_a
+    gains = kalman_gains(profile.macro.mass_kg, period_s, noise_m, control.macro_drift_n_per_sqrt_s)
+    e["macro_position_gain_ratio"], e["macro_velocity_gain_per_s"], e["macro_force_gain_n_per_m"] = gains
+    if profile.micro is not None:
+        e["micro_amperes_per_word"] = 1e-3 * profile.micro.rated_current_a
+        gains = kalman_gains(profile.micro.mass_kg, period_s, noise_m, control.micro_drift_n_per_sqrt_s)
+        e["micro_position_gain_ratio"], e["micro_velocity_gain_per_s"], e["micro_force_gain_n_per_m"] = gains
+    return e
+
+
+def init_model() -> np.ndarray:
+    """Make the believed machine's PLANT_STATE; the first sample places it."""
+    return np.zeros(1, PLANT_STATE)
+
+
+@compiled
+def start(e, s, m):
+    """Place the believed machine at rest at the first sample."""
+    s.macro_position_m = m.macro_position_m
+    s.end_position_m = m.end_position_m
+    s.t_s = 0.0
+    s.macro_velocity_m_per_s = 0.0
+    s.end_velocity_m_per_s = 0.0
+    s.macro_acceleration_m_per_s2 = 0.0
+    s.end_acceleration_m_per_s2 = 0.0
+    s.macro_disturbance_n = 0.0
+    s.micro_disturbance_n = 0.0
+    e.cycle = m.cycle
+    e.started = 1.0
+
+
+@compiled
+def correct(e, s, q, m):
+    """Take a fresh sample into the believed machine."""
+    innovation = m.macro_position_m - s.macro_position_m
+    e.macro_innovation_m = innovation
+    s.macro_position_m += e.macro_position_gain_ratio * innovation
+    s.macro_velocity_m_per_s += e.macro_velocity_gain_per_s * innovation
+    s.macro_disturbance_n += e.macro_force_gain_n_per_m * innovation
+    if q.has_micro != 0.0:
+        innovation = m.end_position_m - s.end_position_m
+        e.end_innovation_m = innovation
+        s.end_position_m += e.micro_position_gain_ratio * innovation
+        s.end_velocity_m_per_s += e.micro_velocity_gain_per_s * innovation
+        s.micro_disturbance_n += e.micro_force_gain_n_per_m * innovation
+    else:
+        s.end_position_m = s.macro_position_m
+        s.end_velocity_m_per_s = s.macro_velocity_m_per_s

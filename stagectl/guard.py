@@ -1,0 +1,190 @@
+"""The last word before the wire: limits, written so that nan fails. Knows no law and shares no code with one.
+
+Pure; knows no bus and no clock.
+"""
+
+import numpy as np
+
+from stagectl.compiled import compiled
+from stagectl.signals import Stop
+
+GUARD = np.dtype(
+    [
+        ("travel_low_m", "f8"),
+        ("travel_high_m", "f8"),
+        ("velocity_limit_m_per_s", "f8"),
+        ("stop_deceleration_m_per_s2", "f8"),
+        ("macro_force_limit_n", "f8"),
+        ("micro_force_limit_n", "f8"),
+        ("following_error_m", "f8"),
+        ("stroke_low_m", "f8"),
+        ("stroke_high_m", "f8"),
+        ("sensor_age_ns", "f8"),
+        ("overrun_ns", "f8"),
+        ("silent_cycles", "f8"),
+        ("lost_commands", "f8"),
+        ("macro_thermal_n", "f8"),
+        ("macro_thermal_share", "f8"),  # period / time constant
+        ("micro_thermal_n", "f8"),
+        ("micro_thermal_share", "f8"),
+        ("input_trip_mask", "f8"),
+        ("velocity_share", "f8"),
+        ("has_micro", "f8"),
+        ("has_drives", "f8"),  # 0 behind the value seam: no statusword, inputs, TPDOs
+        ("period_s", "f8"),
+        ("started", "f8"),
+        ("cycle", "f8"),
+        ("macro_position_m", "f8"),
+        ("macro_velocity_m_per_s", "f8"),
+        ("macro_heat_n2", "f8"),
+        ("micro_heat_n2", "f8"),
+        ("macro_silence", "f8"),
+        ("micro_silence", "f8"),
+        ("commands_lost", "f8"),
+    ]
+)
+
+_STROKE_SHARE = 0.95  # of the stroke: the hard stops are beyond
+_VELOCITY_SHARE = 0.2  # of a new difference in the guard's own velocity: 5 ms, 5 nm noise gives 2 um/s
+
+NEGATIVE_LIMIT, POSITIVE_LIMIT, SAFE_TORQUE_OFF = 1 << 0, 1 << 1, 1 << 3  # 0x60FD, CiA 402 (bit 3: interlock)
+PRESSURE_LOW = 1 << 16  # the first manufacturer's bit, as in the EDS
+_OPERATION_ENABLED, _STATE_MASK = 0x27, 0x6F
+
+# numba folds plain integers; enumeration members cost a lookup
+_NONE = int(Stop.NONE)
+_TRAVEL = int(Stop.TRAVEL)
+_VELOCITY = int(Stop.VELOCITY)
+_FORCE = int(Stop.FORCE)
+_FOLLOWING_ERROR = int(Stop.FOLLOWING_ERROR)
+_MICRO_STROKE = int(Stop.MICRO_STROKE)
+_SENSOR_AGE = int(Stop.SENSOR_AGE)
+_REFERENCE_LOST = int(Stop.REFERENCE_LOST)
+_OVERRUN = int(Stop.OVERRUN)
+_THERMAL = int(Stop.THERMAL)
+_LEASE = int(Stop.LEASE)
+_COMMAND_NOT_FINITE = int(Stop.COMMAND_NOT_FINITE)
+_MEASUREMENT_NOT_FINITE = int(Stop.MEASUREMENT_NOT_FINITE)
+_DRIVE_FAULT = int(Stop.DRIVE_FAULT)
+_DIGITAL_INPUT = int(Stop.DIGITAL_INPUT)
+_EMERGENCY = int(Stop.EMERGENCY)
+_LINK_SILENT = int(Stop.LINK_SILENT)
+_COMMAND_LOST = int(Stop.COMMAND_LOST)
+
+
+def init(profile, *, has_drives: bool) -> np.ndarray:
+    """Make GUARD from the profile's limits."""
+    g = np.zeros(1, GUARD)
+    macro, micro, trip = profile.macro, profile.micro, profile.trip
+    period_s = 1.0 / profile.cycle.rate_hz
+    g["period_s"] = period_s
+    g["has_drives"] = float(has_drives)
+    g["travel_low_m"], g["travel_high_m"] = macro.travel_m
+    g["velocity_limit_m_per_s"] = macro.velocity_limit_m_per_s
+    g["stop_deceleration_m_per_s2"] = macro.stop_deceleration_m_per_s2
+    g["macro_force_limit_n"] = macro.force_limit_n
+    g["following_error_m"] = profile.control.error_limit_m
+    g["sensor_age_ns"] = trip.sensor_age_s * 1e9
+    g["overrun_ns"] = trip.overrun_s * 1e9
+    g["silent_cycles"] = max(3.0, trip.sensor_age_s / period_s)
+    g["lost_commands"] = max(3.0, trip.sensor_age_s / period_s)
+    g["input_trip_mask"] = NEGATIVE_LIMIT | POSITIVE_LIMIT | SAFE_TORQUE_OFF | PRESSURE_LOW
+    g["velocity_share"] = _VELOCITY_SHARE
+    g["macro_thermal_n"] = macro.thermal_force_n
+    g["macro_thermal_share"] = period_s / macro.thermal_time_constant_s
+    if micro is not None:
+        g["has_micro"] = 1.0
+        g["micro_force_limit_n"] = micro.force_limit_n
+        g["stroke_low_m"] = micro.stroke_m[0] * _STROKE_SHARE
+        g["stroke_high_m"] = micro.stroke_m[1] * _STROKE_SHARE
+        g["micro_thermal_n"] = micro.thermal_force_n
+        g["micro_thermal_share"] = period_s / micro.thermal_time_constant_s
+    return g
+
+
+@compiled
+def _drives_stop(g, m):
+    """Return why the drives' own words end the run."""
+    if m.emergency != 0:
+        return _EMERGENCY
+    trip = int(g.input_trip_mask)
+    inputs = m.macro_digital_inputs | m.micro_digital_inputs
+    if inputs & trip != 0:
+        return _DIGITAL_INPUT
+    g.macro_silence = 0.0 if m.tpdos_new & 1 else g.macro_silence + 1.0
+    g.micro_silence = 0.0 if m.tpdos_new & 2 or g.has_micro == 0.0 else g.micro_silence + 1.0
+    if not (g.macro_silence <= g.silent_cycles and g.micro_silence <= g.silent_cycles):
+        return _LINK_SILENT
+    if m.macro_statusword & _STATE_MASK != _OPERATION_ENABLED:
+        return _DRIVE_FAULT
+    if g.has_micro != 0.0 and m.micro_statusword & _STATE_MASK != _OPERATION_ENABLED:
+        return _DRIVE_FAULT
+    g.commands_lost = g.commands_lost + 1.0 if m.command_lost != 0 else 0.0
+    if not g.commands_lost <= g.lost_commands:
+        return _COMMAND_LOST
+    return _NONE
+
+
+@compiled
+def _motion_stop(g, m, now):
+    """Return why position, speed or stroke end the run."""
+    if g.started == 0.0:
+        g.started = 1.0
+        g.macro_position_m = m.macro_position_m
+        g.macro_velocity_m_per_s = now.velocity_m_per_s
+        g.cycle = m.cycle
+    elapsed = m.cycle - g.cycle
+    if elapsed > 0 and m.samples_new > 0:
+        rate = (m.macro_position_m - g.macro_position_m) / (elapsed * g.period_s)
+        g.macro_velocity_m_per_s += g.velocity_share * (rate - g.macro_velocity_m_per_s)
+        g.macro_position_m = m.macro_position_m
+        g.cycle = m.cycle
+    v = g.macro_velocity_m_per_s
+    if not g.travel_low_m <= m.macro_position_m <= g.travel_high_m:
+        return _TRAVEL
+    if not abs(v) <= g.velocity_limit_m_per_s:
+        return _VELOCITY
+    rest_m = m.macro_position_m + 0.5 * v * abs(v) / g.stop_deceleration_m_per_s2
+    if not g.travel_low_m <= rest_m <= g.travel_high_m:
+        return _VELOCITY
+    if not abs(m.end_position_m - now.position_m) <= g.following_error_m:
+        return _FOLLOWING_ERROR
+    if g.has_micro != 0.0 and not g.stroke_low_m <= m.end_position_m - m.macro_position_m <= g.stroke_high_m:
+        return _MICRO_STROKE
+    return _NONE
+
+
+@compiled
+def step(g, m, now, macro_n, micro_n):
+    """Return the Stop code for this cycle, NONE to go on; forces are what the law asked for."""
+    if not (np.isfinite(m.macro_position_m) and np.isfinite(m.end_position_m)):
+        return _MEASUREMENT_NOT_FINITE
+    if not (np.isfinite(macro_n) and np.isfinite(micro_n)):
+        return _COMMAND_NOT_FINITE
+    if not abs(macro_n) <= g.macro_force_limit_n:
+        return _FORCE
+    if g.has_micro != 0.0 and not abs(micro_n) <= g.micro_force_limit_n:
+        return _FORCE
+    if m.reference_lost != 0:
+        return _REFERENCE_LOST
+    if not m.t_ns - m.sample_t_ns <= g.sensor_age_ns:
+        return _SENSOR_AGE
+    if not m.overrun_ns <= g.overrun_ns:
+        return _OVERRUN
+    if not m.lease_left_ns > 0:
+        return _LEASE
+    if g.has_drives != 0.0:
+        stop = _drives_stop(g, m)
+        if stop != _NONE:
+            return stop
+    stop = _motion_stop(g, m, now)
+    if stop != _NONE:
+        return stop
+    g.macro_heat_n2 += g.macro_thermal_share * (macro_n * macro_n - g.macro_heat_n2)
+    if not g.macro_heat_n2 <= g.macro_thermal_n * g.macro_thermal_n:
+        return _THERMAL
+    if g.has_micro != 0.0:
+        g.micro_heat_n2 += g.micro_thermal_share * (micro_n * micro_n - g.micro_heat_n2)
+        if not g.micro_heat_n2 <= g.micro_thermal_n * g.micro_thermal_n:
+            return _THERMAL
+    return _NONE

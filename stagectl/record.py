@@ -1,0 +1,517 @@
+"""A run as a folder: manifest.json, samples.arrow, events.jsonl, snapshot.npz; written as it happens, read afterwards.
+
+Reads no clock: times come with the rows and events.
+"""
+
+import contextlib
+import io
+import json
+import os
+import zipfile
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import structlog
+
+from stagectl.errors import RecordError
+from stagectl.ring import RingReader, writer_alive
+from stagectl.row import ROW, layout_hash
+from stagectl.samples_file import (
+    BATCH_NS,
+    BATCH_ROWS_COUNT,
+    END_MARKER,
+    Piece,
+    batch_ends,
+    empty_rows,
+    encode_batch,
+    encode_schema,
+    fill_rows,
+    is_closed,
+    scan,
+    schema_of,
+    to_batch,
+)
+from stagectl.whole_file import WholeFile, replace_whole
+
+MANIFEST = "manifest.json"
+SAMPLES = "samples.arrow"
+EVENTS = "events.jsonl"
+SNAPSHOT = "snapshot.npz"
+
+FORMAT = 1
+"""Version of the folder's shape, in the manifest as record.format."""
+
+RESERVE_BYTES = 2 << 20
+"""Kept free for the end of a run: about 1 s of rows (1.2 MB at 1 kHz) and the manifest still fit on a full disk."""
+
+_RESERVE = ".reserve"
+
+
+def plain(value: Any) -> Any:
+    """Turn what JSON does not know into what it does; structured arrays become name: value."""
+    if isinstance(value, np.ndarray | np.void) and value.dtype.names:
+        if value.shape not in ((), (1,)):
+            return [plain(item) for item in value]
+        return {name: plain(value[name].reshape(-1)[0]) for name in value.dtype.names}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, bytes):
+        return value.hex()
+    raise TypeError(f"{value!r} of type {type(value).__name__} can't stand in a run's JSON")
+
+
+def _to_json(value: Any, indent: int | None = None) -> str:
+    return json.dumps(value, default=plain, indent=indent, ensure_ascii=False)
+
+
+def _event_first(logger, method: str, event_dict):  # pyright: ignore[reportUnusedParameter]
+    return {"event": event_dict.pop("event"), **event_dict}
+
+
+class _LineSink:
+    """What structlog's WriteLogger calls: one text per event, then flush."""
+
+    def __init__(self, put: Callable[[bytes], None]):
+        self._put = put
+
+    def write(self, text: str) -> None:
+        self._put(text.encode())
+
+    def flush(self) -> None:
+        """Do nothing: `write` has put the line into the file."""
+
+
+def _structured_log(put: Callable[[bytes], None]):
+    return structlog.wrap_logger(
+        structlog.WriteLogger(_LineSink(put)),  # pyright: ignore[reportArgumentType]
+        processors=[_event_first, structlog.processors.JSONRenderer(default=plain, ensure_ascii=False)],
+        wrapper_class=structlog.make_filtering_bound_logger(0),
+        cache_logger_on_first_use=True,
+    )
+
+
+class Recorder:
+    """Writes one run folder. A row or event that was handed over is never dropped.
+
+    On a full disk every method raises RecordError; what did not fit stays held, goes out with the next call that
+    finds room, and must not be handed over again. The first such error frees a reserve on the disk, so that the
+    rows until the stage stands, and the manifest, still fit.
+    """
+
+    def __init__(self, folder: Path, manifest: dict, fields: Sequence[str] | None = None):
+        """Make the folder and write the manifest; `fields` limits the recorded ROW fields (imported tables)."""
+        self.folder = Path(folder)
+        self.manifest = dict(manifest)
+        self.rows_count = 0
+        self._schema = schema_of(fields)
+        self._pending = np.zeros(BATCH_ROWS_COUNT, ROW)
+        self._pending_count = 0
+        self._first_t_ns: int | None = None
+        self._last_t_ns: int | None = None
+        self._marks: deque[tuple[int, int | None]] = deque([(0, None)])  # (rows, cycle) at the end of each piece
+        self._closed = False
+        for name in (MANIFEST, SAMPLES, EVENTS):
+            if (self.folder / name).exists():
+                raise RecordError(f"{self.folder}: already holds a run ({name}); give the run another folder")
+        self.manifest["record"] = {
+            "format": FORMAT,
+            "layout": layout_hash(ROW),
+            "fields": self._schema.names,
+            "state": "recording",
+            "pid": os.getpid(),
+        }
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._write_manifest()
+            _reserve(self.folder / _RESERVE)
+            self._samples = WholeFile(self.folder / SAMPLES)
+            self._samples.put(encode_schema(self._schema))
+            self._events = WholeFile(self.folder / EVENTS)
+        except OSError as error:
+            raise RecordError(
+                f"{self.folder}: can't begin a run: {error.strerror} ({free_text(self.folder)}); nothing was recorded; "
+                "free space, check permissions, or give another folder"
+            ) from error
+        self._log = _structured_log(self._put_event)
+
+    def append(self, rows: np.ndarray) -> None:
+        """Take over rows, shape (n,) of ROW; they are in the file within 0.25 s of their time. Errors: RecordError."""
+        if rows.dtype != ROW:
+            raise RecordError(f"{self.folder}: rows of another layout ({rows.dtype.itemsize} bytes); record ROW only")
+        count = len(rows)
+        if count == 0:
+            return
+        if self._closed:
+            raise RecordError(f"{self.folder}: {count} rows came after the run was closed; start a new run")
+        if self._first_t_ns is None:
+            self._first_t_ns = int(rows["t_ns"][0])
+        self._last_t_ns = int(rows["t_ns"][-1])
+        end = self._pending_count + count
+        if end > len(self._pending):
+            grown = np.zeros(max(end, 2 * len(self._pending)), ROW)
+            grown[: self._pending_count] = self._pending[: self._pending_count]
+            self._pending = grown
+        self._pending[self._pending_count : end] = rows
+        self._pending_count = end
+        self.rows_count += count
+        span_ns = self._last_t_ns - int(self._pending["t_ns"][0])
+        if not 0 <= span_ns < BATCH_NS or end >= BATCH_ROWS_COUNT:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write every row and event taken over so far. Errors: RecordError (disk full)."""
+        start, encoded = 0, []
+        rows = self._pending[: self._pending_count]
+        before = self.rows_count - self._pending_count
+        for end in batch_ends(rows["t_ns"]):
+            encoded.append(encode_batch(to_batch(rows[start:end], self._schema)))
+            self._marks.append((before + end, int(rows["cycle"][end - 1])))
+            start = end
+        self._pending_count = 0
+        self._samples.hold(encoded)
+        self._write(self._write_held)
+
+    def event(self, name: str, t_ns: int, row: int | None = None, **fields: Any) -> None:
+        """Write one line to events.jsonl; `row` is the row that it precedes (the next one by default)."""
+        self._log.info(name, t_ns=int(t_ns), row=self.rows_count if row is None else int(row), **fields)
+
+    def save_snapshot(self, states: Mapping[str, np.ndarray]) -> None:
+        """Write the states that the first row begins from, bit for bit. Errors: RecordError."""
+        for name, state in states.items():
+            if np.asarray(state).dtype.hasobject:
+                raise RecordError(f"{self.folder}: state {name!r} holds Python objects; give arrays of numbers")
+        content = io.BytesIO()
+        np.savez(content, allow_pickle=False, **{name: np.asarray(state) for name, state in states.items()})
+        self._write(lambda: replace_whole(self.folder / SNAPSHOT, content.getvalue()))
+
+    def close(self, end: Mapping[str, Any] | None = None) -> None:
+        """Write all, mark the stream as ended, put `end` (how the run ended) into the manifest. Errors: RecordError.
+
+        After an error the recorder is still open: make room and close again, or `abandon` it.
+        """
+        if self._closed:
+            return
+        (self.folder / _RESERVE).unlink(missing_ok=True)  # this is the end that it was kept for
+        self.flush()
+        state = {
+            "state": "closed",
+            "rows_count": self.rows_count,
+            "first_t_ns": self._first_t_ns,
+            "last_t_ns": self._last_t_ns,
+        }
+        self.manifest["record"] = {**self.manifest["record"], **state}
+        self.manifest["end"] = dict(end or {})
+        self._write(self._write_manifest)
+        self._write(lambda: self._samples.put(END_MARKER))
+        self._closed = True
+        self.abandon()
+
+    def abandon(self) -> None:
+        """Let go of the files as they are: whole up to the last batch, and not marked as ended."""
+        self._closed = True
+        try:
+            self._samples.close()
+        finally:
+            self._events.close()
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        self.close(None if error is None else {"error": f"{type(error).__name__}: {error}"})
+
+    def _put_event(self, line: bytes) -> None:
+        self._events.hold([line])
+        self._write(self._events.write_held)
+
+    def _write_held(self) -> None:
+        self._samples.write_held()
+        self._events.write_held()
+
+    def _write_manifest(self) -> None:
+        replace_whole(self.folder / MANIFEST, _to_json(self.manifest, indent=2).encode())
+
+    def _write(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except OSError as error:
+            with contextlib.suppress(OSError):  # what still does not fit stays held, and the text below says so
+                (self.folder / _RESERVE).unlink(missing_ok=True)
+                self._write_held()
+            raise RecordError(self._loss_text(error)) from error
+
+    def _loss_text(self, error: OSError) -> str:
+        while len(self._marks) > self._samples.held_count + 1:
+            self._marks.popleft()
+        rows_count, cycle = self._marks[0]
+        safe = f"{rows_count} rows, to cycle {cycle}, are safe" if rows_count else "no row is on the disk yet"
+        return (
+            f"{self.folder}: can't write the run: {error.strerror} ({free_text(self.folder)}); {safe}; "
+            f"{self.rows_count - rows_count} rows and {self._events.held_count} events are held in memory; "
+            "end the run, free space on that disk and close it again: they are written then"
+        )
+
+
+def _reserve(path: Path) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        os.posix_fallocate(descriptor, 0, RESERVE_BYTES)
+    finally:
+        os.close(descriptor)
+
+
+def free_text(folder: Path) -> str:
+    """Say how much room the disk of `folder` has."""
+    try:
+        room = os.statvfs(folder)
+    except OSError:
+        return "room unknown"
+    return f"{room.f_bavail * room.f_frsize / 1e6:.1f} MB free"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run folder as it was read."""
+
+    folder: Path
+    manifest: dict
+    rows: np.ndarray
+    """Shape (n,) of ROW; fields that the file lacks hold `row.absent_value`."""
+    events: list[dict]
+    snapshot: dict[str, np.ndarray]
+    """Empty where the run has none."""
+    truncated: bool
+    """True where the files have no proper end: cut, damaged, or still being written."""
+    missing_fields: tuple[str, ...]
+    """ROW fields that the file does not have."""
+    unknown_fields: tuple[str, ...]
+    """Fields of the file that this version does not know; their values are not in `rows`."""
+
+
+def read_manifest(folder: Path) -> dict:
+    """Return a run's manifest. Errors: RecordError."""
+    path = Path(folder) / MANIFEST
+    try:
+        manifest = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise RecordError(f"{folder}: not a run folder (no {MANIFEST}); `stagectl runs list` shows the runs") from error
+    except (OSError, ValueError) as error:
+        raise RecordError(f"{path}: can't be read: {error}; the other files of the run are not affected") from error
+    if not isinstance(manifest, dict):
+        raise RecordError(f"{path}: holds a {type(manifest).__name__} and not a table; it is not ours")
+    found = manifest.get("record", {}).get("format", FORMAT)
+    if found != FORMAT:
+        raise RecordError(f"{path}: run format {found}, this version reads {FORMAT}; use the version that made it")
+    return manifest
+
+
+def read_batches(folder: Path) -> Iterator[np.ndarray]:
+    """Yield the rows of a run batch by batch, shape (n,) of ROW, to its end or to where it is cut."""
+    path = Path(folder) / SAMPLES
+    for piece in scan(path):
+        if piece.batch is not None and len(piece.batch):
+            yield _rows_of(piece, path)
+
+
+def _rows_of(piece: Piece, path: Path) -> np.ndarray:
+    if piece.batch is None:
+        return np.zeros(0, ROW)
+    rows = empty_rows(len(piece.batch), piece.schema)
+    fill_rows(rows, piece.batch, str(path))
+    return rows
+
+
+def recorded_fields(folder: Path) -> tuple[str, ...]:
+    """Return the names of the fields that a run's samples file has; none where it has no schema yet."""
+    for piece in scan(Path(folder) / SAMPLES):
+        return tuple(piece.schema.names)
+    return ()
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run, whole or cut short. Errors: RecordError where there is no run or no sense in it."""
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    path = folder / SAMPLES
+    parts, names, end_bytes = [np.zeros(0, ROW)], (), 0
+    if path.exists():
+        for piece in scan(path):
+            names, end_bytes = tuple(piece.schema.names), piece.end_bytes
+            if piece.batch is not None and len(piece.batch):
+                parts.append(_rows_of(piece, path))
+    events, events_cut = _read_events(folder / EVENTS)
+    return Run(
+        folder=folder,
+        manifest=manifest,
+        rows=np.concatenate(parts),
+        events=events,
+        snapshot=_read_snapshot(folder / SNAPSHOT),
+        truncated=events_cut or not path.exists() or not is_closed(path, end_bytes),
+        missing_fields=tuple(name for name in ROW.names or () if name not in names),
+        unknown_fields=tuple(name for name in names if name not in (ROW.names or ())),
+    )
+
+
+def _read_events(path: Path) -> tuple[list[dict], bool]:
+    """Return the whole events, and whether a half one follows them."""
+    if not path.exists():
+        return [], True
+    events = []
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise RecordError(f"{path}: can't be read: {error.strerror}; check permissions and disk") from error
+    lines = content.split(b"\n")
+    for line in lines[:-1]:
+        try:
+            events.append(json.loads(line))
+        except ValueError:
+            return events, True
+    return events, lines[-1] != b""
+
+
+def _read_snapshot(path: Path) -> dict[str, np.ndarray]:
+    if not path.exists():
+        return {}
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
+            return {name: content[name] for name in content.files}
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise RecordError(
+            f"{path}: can't be read: {error}; the run can be looked at, not replayed: move it away"
+        ) from error
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What `recover` saved."""
+
+    rows_count: int
+    """Rows that the ring had and the file had not."""
+    rows_lost_count: int
+    """Rows that the ring had already overwritten when it was drained."""
+
+
+def recover(ring_path: Path, folder: Path, keep_ring: bool = False) -> Recovery:
+    """Write what the ring of a dead servo holds, and its run does not, behind the run's last whole batch.
+
+    Rows are told apart by their time. Removes the ring when all is on the disk. A servo may drain its own ring.
+    Errors: RecordError; run and ring are as they were then, and the call can be repeated.
+    """
+    ring_path, folder = Path(ring_path), Path(folder)
+    manifest = read_manifest(folder)
+    reader = RingReader(ring_path)
+    if writer_alive(ring_path) and reader.writer_pid != os.getpid():
+        raise RecordError(f"{ring_path}: its servo (pid {reader.writer_pid}) is alive; stop it before recovering")
+    if reader.run_folder is not None and reader.run_folder.resolve() != folder.resolve():
+        raise RecordError(f"{ring_path}: holds rows of {reader.run_folder}, not of {folder}; recover them there")
+    held_rows = reader.read_new()
+    try:
+        samples = WholeFile(folder / SAMPLES, resume=True)
+    except BlockingIOError as error:
+        raise RecordError(f"{folder}: a process still records this run; end it before recovering") from error
+    except OSError as error:
+        raise RecordError(f"{folder}: can't go on with {SAMPLES}: {error.strerror}; check permissions") from error
+    try:
+        recovery = _join(samples, folder, manifest, held_rows, reader.lost_count)
+        samples.put(END_MARKER)
+        _finish_recovered(folder, manifest, recovery)
+    except OSError as error:
+        raise RecordError(
+            f"{folder}: can't write recovered rows: {error.strerror} ({free_text(folder)}); the ring {ring_path} keeps "
+            "them until the host restarts; free space on that disk and recover again"
+        ) from error
+    finally:
+        samples.close()
+    if not keep_ring:
+        ring_path.unlink(missing_ok=True)
+    return recovery
+
+
+def _join(samples: WholeFile, folder: Path, manifest: dict, held_rows: np.ndarray, overwritten_count: int) -> Recovery:
+    """Cut the samples at their last whole batch and append the rows that are newer. Errors: RecordError, OSError."""
+    schema, end_bytes, last = None, 0, None
+    for piece in scan(folder / SAMPLES):
+        schema, end_bytes = piece.schema, piece.end_bytes
+        if piece.batch is not None and len(piece.batch):
+            last = _rows_of(piece, folder / SAMPLES)[-1]
+    if schema is not None and not schema.equals(schema_of()):
+        raise RecordError(
+            f"{folder}: {SAMPLES} has another layout than the ring; recover with the version that made it"
+        )
+    start_t_ns = manifest.get("start_t_ns", np.iinfo(np.int64).min) if last is None else int(last["t_ns"]) + 1
+    rows = held_rows[held_rows["t_ns"] >= start_t_ns]
+    lost_count = 0
+    if overwritten_count and last is None:
+        lost_count = overwritten_count
+    elif overwritten_count and last is not None and len(rows) == len(held_rows) and len(rows):
+        lost_count = max(0, int(rows["cycle"][0]) - int(last["cycle"]) - 1)
+    samples.cut(end_bytes)
+    if schema is None:
+        samples.put(encode_schema(schema_of()))
+    start = 0
+    for end in batch_ends(rows["t_ns"]):
+        samples.put(encode_batch(to_batch(rows[start:end], schema_of())))
+        start = end
+    return Recovery(rows_count=len(rows), rows_lost_count=lost_count)
+
+
+def _finish_recovered(folder: Path, manifest: dict, recovery: Recovery) -> None:
+    """Say in events and manifest what was recovered. Errors: OSError."""
+    count, first_t_ns, last_t_ns = 0, None, None
+    for rows in read_batches(folder):
+        first_t_ns = int(rows["t_ns"][0]) if first_t_ns is None else first_t_ns
+        last_t_ns = int(rows["t_ns"][-1])
+        count += len(rows)
+    state = {
+        "state": "recovered",
+        "rows_count": count,
+        "first_t_ns": first_t_ns,
+        "last_t_ns": last_t_ns,
+        "rows_recovered_count": recovery.rows_count,
+        "rows_lost_count": recovery.rows_lost_count,
+    }
+    path = folder / EVENTS
+    events = WholeFile(path, resume=True)
+    try:
+        content = path.read_bytes()
+        events.cut(content.rfind(b"\n") + 1)
+        _structured_log(events.put).info(
+            "recovered",
+            t_ns=last_t_ns or 0,
+            row=count,
+            rows_recovered_count=recovery.rows_count,
+            rows_lost_count=recovery.rows_lost_count,
+        )
+    finally:
+        events.close()
+    manifest["record"] = {**manifest.get("record", {}), **state}
+    replace_whole(folder / MANIFEST, _to_json(manifest, indent=2).encode())
+    (folder / _RESERVE).unlink(missing_ok=True)
+
+
+def recover_orphans(ring_folder: Path = Path("/dev/shm")) -> list[tuple[Path, Recovery | RecordError]]:
+    """Recover every `stagectl-*.ring` whose servo is dead into the run that it names; one bad ring stops no other.
+
+    Returns (ring, what was saved or why not) for each.
+    """
+    outcomes: list[tuple[Path, Recovery | RecordError]] = []
+    for ring_path in sorted(Path(ring_folder).glob("stagectl-*.ring")):
+        if writer_alive(ring_path):
+            continue
+        try:
+            folder = RingReader(ring_path).run_folder
+            if folder is None:
+                raise RecordError(f"{ring_path}: names no run; recover it into its run, or remove the file")
+            outcomes.append((ring_path, recover(ring_path, folder)))
+        except RecordError as error:
+            outcomes.append((ring_path, error))
+    return outcomes

@@ -1,0 +1,90 @@
+"""What supervisor and servo say to each other: two fixed-size blocks, each with one writer.
+
+Pure; knows no memory and no clock.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+
+from stagectl.plant import PLANT_PARAMETERS
+
+
+class Mode(IntEnum):
+    """What the supervisor asks of the servo."""
+
+    IDLE = 0  # drives without power
+    HOME_DRIVE = 1  # the macro's drive runs its own homing; the micro stays without power
+    TRACK = 2  # enable, then follow segments under a law
+    STOP = 3  # bring the stage to rest under the law, then take the power away
+    RESET = 4  # acknowledge a fault; enables nothing
+
+
+class Phase(IntEnum):
+    """What the servo is doing; the `run_phase` of a row."""
+
+    IDLE = 0
+    ENABLING = 1
+    HOMING_DRIVE = 2
+    HOMED_DRIVE = 3
+    TRACKING = 4
+    STOPPING = 5  # under the law, towards rest
+    QUICK_STOP = 6  # by the drives
+    STOPPED = 7  # a run ended by itself: `stop` says why; left by RESET
+
+
+REQUEST = np.dtype(
+    [
+        ("counter", "i8"),  # alive: changes all the time
+        ("mode", "i8"),  # Mode
+        ("law_number", "i8"),  # place in stagectl.tick.LAWS
+        ("segment_number", "i8"),  # a change starts the segment
+        ("segment_start", "i8"),  # its first row in the segment table
+        ("segment_rows", "i8"),
+        ("lease_until_t_ns", "i8"),
+        ("acknowledge_number", "i8"),
+        ("update_number", "i8"),  # a change takes over zeros and belief
+        ("homing_id", "i8"),
+        ("macro_zero_counts", "f8"),
+        ("end_zero_counts", "f8"),
+        *((f"belief_{name}", "f8") for name in PLANT_PARAMETERS.names or ()),
+    ]
+)
+"""Supervisor to servo."""
+
+STATUS = np.dtype(
+    [
+        ("rows", "i8"),  # cycles done
+        ("t_ns", "i8"),
+        ("phase", "i8"),
+        ("stop", "i8"),  # Stop
+        ("segment_number", "i8"),  # the segment under way or done
+        ("segment_left_rows", "i8"),
+        ("update_number", "i8"),
+        ("sensor_ready", "i8"),  # sample clock locked, both axes valid
+        ("reference_lost", "i8"),
+        ("macro_statusword", "i8"),
+        ("micro_statusword", "i8"),
+        ("macro_counts", "f8"),
+        ("end_counts", "f8"),
+        ("macro_position_m", "f8"),
+        ("end_position_m", "f8"),
+        ("macro_encoder_m", "f8"),
+        ("setpoint_position_m", "f8"),
+        ("setpoint_relative_position_m", "f8"),
+        ("error_m", "f8"),
+        ("left_m", "f8"),
+        ("right_m", "f8"),
+        ("left_stiffness_n_per_m", "f8"),
+        ("right_stiffness_n_per_m", "f8"),
+        ("left_sd_m", "f8"),
+        ("right_sd_m", "f8"),
+        ("left_stiffness_sd_n_per_m", "f8"),
+        ("right_stiffness_sd_n_per_m", "f8"),
+        ("emergency", "i8"),
+        ("inputs", "i8"),
+        ("missed_cycles", "i8"),
+        ("lost_samples", "i8"),
+    ]
+)
+"""Servo to supervisor, newest state only; the ring holds every cycle."""

@@ -1,0 +1,410 @@
+"""The servo: one cycle of receive, decode, estimate, law, guard, encode, send; then record.
+
+The same `Servo.cycle` serves hardware, the rig over the wire and batch in virtual time: only the transport differs.
+It owns nothing that waits but the transport, and speaks with the supervisor through one request block, one status
+block and the ring. No SDO, no files, no logging here.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from drivers import cia402
+from drivers.wire import HEARTBEAT_FRAME, SYNC_FRAME, Inbox, WireDecoder, WireEncoder
+from stagectl.requests import REQUEST, STATUS, Mode, Phase
+from stagectl.ring import RequestReader, RequestWriter, RingWriter
+from stagectl.row import new_rows
+from stagectl.row_fill import fill_row
+from stagectl.signals import COMMAND, SETPOINT, Stop
+from stagectl.tracker import Tracker, belief_of
+
+_ENABLE_TIMEOUT_S = 2.0
+_QUICK_STOP_TIMEOUT_S = 5.0
+_HEARTBEATS_PER_TIMEOUT = 4
+_REST_M_PER_S = 1e-3
+_READY_SAMPLES = 200  # before the sample clock counts as locked: 60 us / 200 = 0.3 us
+
+
+class Transport(Protocol):
+    """Bus, serial line and clock of one world."""
+
+    lost_count: int
+
+    def now_t_ns(self) -> int:
+        """Return the time of this world's clock."""
+        ...
+
+    def receive(self, deadline_t_ns: int, inbox: Inbox) -> int:
+        """Wait until the deadline, put what arrived into the inbox, return the time."""
+        ...
+
+    def send(self, frames: list[tuple[int, bytes]]) -> tuple[bool, int]:
+        """Put frames on the bus in this order; returns (all went out, end of the last)."""
+        ...
+
+
+class Servo:
+    """All that one stage's loop holds between cycles."""
+
+    def __init__(
+        self,
+        profile,
+        decoder: WireDecoder,
+        encoder: WireEncoder,
+        tracker: Tracker,
+        transport: Transport,
+        segments: np.ndarray,
+        requests: RequestReader,
+        status: RequestWriter,
+        ring: RingWriter,
+        clock_ns: Callable[[], int] = time.perf_counter_ns,
+    ):
+        """Join the parts; `clock_ns` only measures how long a tick takes."""
+        self.decoder, self.encoder, self.tracker, self.transport = decoder, encoder, tracker, transport
+        self.segments, self.requests, self.status, self.ring = segments, requests, status, ring
+        self._clock_ns = clock_ns
+        self.inbox = Inbox()
+        self.row = new_rows(1)
+        self._fresh_row = new_rows(1)
+        self._status = np.zeros(1, STATUS)
+        self._request = np.zeros(1, REQUEST)
+        self._has_micro = profile.micro is not None
+        self._position_mode = profile.macro.mode == "position"
+        self._period_ns = round(1e9 / profile.cycle.rate_hz)
+        self._period_s = 1.0 / profile.cycle.rate_hz
+        self._phase_ns = profile.cycle.phase_s * 1e9
+        trip = profile.trip
+        self._silence_ns = int(trip.supervisor_silence_s * 1e9)
+        self._heartbeat_every = max(1, int(trip.heartbeat_s / _HEARTBEATS_PER_TIMEOUT * profile.cycle.rate_hz))
+        self._stop_deceleration = 0.5 * profile.macro.stop_deceleration_m_per_s2
+        self.phase = Phase.IDLE
+        self.stop = Stop.NONE
+        self._phase_since_t_ns = 0
+        self._segment_number = 0
+        self._segment_row = 0
+        self._segment_start = 0
+        self._segment_rows = 0
+        self._update_number = 0
+        self._acknowledged = 0
+        self._counter = -1
+        self._counter_t_ns = 0
+        self._rows = 0
+        self._valid_samples = 0
+        self._missed = 0
+        self._command_lost = 0
+        self._last_cycle = -1
+        self._deadline_t_ns = transport.now_t_ns() + self._period_ns
+        self._reset_edge = False
+
+    # ---- one cycle ---------------------------------------------------------------------------------------------
+
+    def cycle(self) -> None:
+        """Run one cycle, from waiting for its start to its row in the ring."""
+        inbox, m = self.inbox, self.tracker.measurement
+        inbox.clear()
+        t_ns = self.transport.receive(self._deadline_t_ns, inbox)
+        lateness_ns = t_ns - self._deadline_t_ns
+        inbox.t_ns = t_ns
+        started_ns = self._clock_ns()
+        self.decoder.decode(inbox, m)
+        self._valid_samples += int(m["samples_new"][0])
+        self._read_request(t_ns)
+        m["command_lost"][0] = self._command_lost
+        m["overrun_ns"][0] = lateness_ns if lateness_ns > self._period_ns else 0
+        m["lease_left_ns"][0] = self._request["lease_until_t_ns"][0] - t_ns
+        macro_target, micro_target = self._advance_phase(t_ns)
+        tracking = self.phase in (Phase.TRACKING, Phase.STOPPING)
+        command = self.tracker.active.command
+        if tracking:
+            self._next_setpoint(int(m["cycle"][0]))
+            self.tracker.active.step()
+            if command["stop"][0] != Stop.NONE:
+                self._end(Stop(int(command["stop"][0])), Phase.QUICK_STOP, t_ns)
+                macro_target, micro_target = cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
+        else:
+            command[...] = np.zeros(1, COMMAND)
+            command["macro_target_m"] = m["macro_encoder_m"]
+        macro_word = self._controlword(int(m["macro_statusword"][0]), macro_target)
+        micro_word = self._controlword(int(m["micro_statusword"][0]), micro_target)
+        if self.phase is Phase.HOMING_DRIVE and macro_word == cia402.ENABLE_OPERATION:
+            macro_word |= cia402.HOMING_START
+        frames = []
+        micro_frame = self.encoder.micro(micro_word, int(command["micro_word"][0]))
+        if micro_frame is not None:
+            frames.append(micro_frame)
+        macro_frame = self.encoder.macro(
+            macro_word, int(command["macro_word"][0]), float(command["macro_target_m"][0])
+        )
+        frames += [macro_frame, SYNC_FRAME]
+        if self._rows % self._heartbeat_every == 0:
+            frames.append(HEARTBEAT_FRAME)
+        tick_ns = self._clock_ns() - started_ns
+        sent, sync_end_t_ns = self.transport.send(frames)
+        self._command_lost = 0 if sent else 1
+        self._record(lateness_ns, tick_ns, sync_end_t_ns, macro_word, micro_word, macro_frame[1], micro_frame)
+        self._publish(t_ns)
+        self._plan_next(t_ns)
+
+    def _plan_next(self, t_ns: int) -> None:
+        """Set the start of the next cycle: the sensor's next sample plus the phase, else a free-running period."""
+        due = self.decoder.next_start_t_ns(self._phase_ns)
+        if due == 0:
+            due = self._deadline_t_ns + self._period_ns
+        now = self.transport.now_t_ns()
+        if due <= now:  # the grid point is gone: skip to the next one and count
+            missed = (now - due) // self._period_ns + 1
+            self._missed += missed
+            due += missed * self._period_ns
+        self._deadline_t_ns = due
+
+    # ---- requests and phases ---------------------------------------------------------------------------------
+
+    def _read_request(self, t_ns: int) -> None:
+        """Take the newest request; notice a supervisor that stands still."""
+        _, request = self.requests.read()
+        self._request[...] = request
+        counter = int(request["counter"][0])
+        if counter != self._counter:
+            self._counter, self._counter_t_ns = counter, t_ns
+        number = int(request["update_number"][0])
+        if number != self._update_number:
+            shifts = self.decoder.set_zeros(float(request["macro_zero_counts"][0]), float(request["end_zero_counts"][0]))
+            self.tracker.measurement["macro_position_m"] += shifts[0]
+            self.tracker.measurement["end_position_m"] += shifts[1]
+            self.tracker.update(belief_of(request), *shifts)
+            self._update_number = number
+
+    def _enter(self, phase: Phase, t_ns: int) -> None:
+        self.phase = phase
+        self._phase_since_t_ns = t_ns
+
+    def _end(self, stop: Stop, phase: Phase, t_ns: int) -> None:
+        """Latch why the run ended (the first reason stays) and go to the phase that brings the stage to rest."""
+        if self.stop is Stop.NONE:
+            self.stop = stop
+        self._enter(phase, t_ns)
+
+    def _advance_phase(self, t_ns: int) -> tuple[cia402.State, cia402.State]:
+        """Move between phases; returns the drive states wanted of macro and micro."""
+        off, on = cia402.State.SWITCH_ON_DISABLED, cia402.State.OPERATION_ENABLED
+        m = self.tracker.measurement
+        mode = Mode(int(self._request["mode"][0]))
+        in_phase_s = (t_ns - self._phase_since_t_ns) * 1e-9
+        macro_state = cia402.state_of(int(m["macro_statusword"][0]))
+        silent = t_ns - self._counter_t_ns > self._silence_ns
+        if self.phase in (Phase.IDLE, Phase.HOMED_DRIVE):
+            if mode is Mode.HOME_DRIVE and self.phase is Phase.IDLE and not silent:
+                self._enter(Phase.HOMING_DRIVE, t_ns)
+            elif mode is Mode.TRACK and not silent:
+                self._enter(Phase.ENABLING, t_ns)
+            elif mode is Mode.IDLE:
+                self._enter(Phase.IDLE, t_ns)
+            return off, off
+        if self.phase is Phase.HOMING_DRIVE:
+            return self._homing(mode, macro_state, silent, t_ns)
+        if self.phase is Phase.ENABLING:
+            if silent or mode is not Mode.TRACK:
+                self._end(Stop.SUPERVISOR_SILENT if silent else Stop.OPERATOR, Phase.STOPPED, t_ns)
+                return off, off
+            micro_on = not self._has_micro or cia402.state_of(int(m["micro_statusword"][0])) is on
+            if macro_state is on and micro_on and m["samples_new"][0] > 0:
+                self.tracker.begin(int(self._request["law_number"][0]))
+                self._last_cycle = int(m["cycle"][0])
+                self._enter(Phase.TRACKING, t_ns)
+            elif in_phase_s > _ENABLE_TIMEOUT_S:
+                self._end(Stop.DRIVE_FAULT, Phase.STOPPED, t_ns)
+            return on, on
+        if self.phase is Phase.TRACKING:
+            if silent:
+                self._end(Stop.SUPERVISOR_SILENT, Phase.STOPPING, t_ns)
+            elif mode is not Mode.TRACK:
+                self._end(Stop.OPERATOR, Phase.STOPPING, t_ns)
+            elif m["lease_left_ns"][0] <= 0:
+                self._end(Stop.LEASE, Phase.STOPPING, t_ns)
+            return on, on
+        if self.phase is Phase.STOPPING:
+            m["lease_left_ns"][0] = max(int(m["lease_left_ns"][0]), self._period_ns)  # coming to rest needs no lease
+            if self.tracker.hold["velocity_m_per_s"][0] == 0.0 and in_phase_s > 0.3:
+                self._enter(Phase.STOPPED, t_ns)
+                return off, off
+            return on, on
+        if self.phase is Phase.QUICK_STOP:
+            if in_phase_s > _QUICK_STOP_TIMEOUT_S:
+                self._enter(Phase.STOPPED, t_ns)
+            return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
+        # STOPPED: hold what the drives hold until the fault is acknowledged
+        number = int(self._request["acknowledge_number"][0])
+        if number != self._acknowledged and mode in (Mode.RESET, Mode.IDLE):
+            self._acknowledged = number
+            self.stop = Stop.NONE
+            m["emergency"][0] = 0
+            self._enter(Phase.IDLE, t_ns)
+        if self.stop in (Stop.OPERATOR, Stop.FINISHED):
+            return off, off
+        return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
+
+    def _homing(self, mode: Mode, state: cia402.State, silent: bool, t_ns: int) -> tuple[cia402.State, cia402.State]:
+        """Let the macro's drive home; the micro stays without power."""
+        off, on = cia402.State.SWITCH_ON_DISABLED, cia402.State.OPERATION_ENABLED
+        m = self.tracker.measurement
+        if silent or mode is not Mode.HOME_DRIVE or m["lease_left_ns"][0] <= 0:
+            self._end(Stop.SUPERVISOR_SILENT if silent else Stop.OPERATOR, Phase.QUICK_STOP, t_ns)
+            return cia402.State.QUICK_STOP_ACTIVE, off
+        if m["emergency"][0] != 0 or state in (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE):
+            self._end(Stop.EMERGENCY if m["emergency"][0] else Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns)
+            return cia402.State.QUICK_STOP_ACTIVE, off
+        if state is on and (t_ns - self._phase_since_t_ns) * 1e-9 > 0.05:
+            progress = cia402.homing_of(int(m["macro_statusword"][0]))
+            if progress is cia402.Homing.ATTAINED:
+                self._enter(Phase.HOMED_DRIVE, t_ns)
+                return off, off
+            if progress in (cia402.Homing.ERROR, cia402.Homing.ERROR_MOVING):
+                self._end(Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns)
+                return cia402.State.QUICK_STOP_ACTIVE, off
+        return on, off
+
+    def _controlword(self, statusword: int, target: cia402.State) -> int:
+        """Return the next controlword; a fault is reset only on request, on a rising edge."""
+        state = cia402.state_of(statusword)
+        if state is cia402.State.FAULT and self._request["mode"][0] == Mode.RESET:
+            self._reset_edge = not self._reset_edge
+            return cia402.FAULT_RESET if self._reset_edge else 0
+        return cia402.controlword(state, target)
+
+    # ---- setpoints ---------------------------------------------------------------------------------------------
+
+    def _next_setpoint(self, cycle: int) -> None:
+        """Advance the reference by the cycles that passed on the sensor's own sequence."""
+        passed = max(cycle - self._last_cycle, 0)
+        self._last_cycle = max(cycle, self._last_cycle)
+        hold = self.tracker.hold
+        request = self._request
+        if self.phase is Phase.STOPPING:
+            self._slow_down(passed)
+        else:
+            number = int(request["segment_number"][0])
+            if number != self._segment_number:
+                self._segment_number = number
+                self._segment_start = int(request["segment_start"][0])
+                self._segment_rows = int(request["segment_rows"][0])
+                self._segment_row = 0
+                if int(request["law_number"][0]) != self.tracker.law_number:
+                    self.tracker.switch(int(request["law_number"][0]))
+                passed = max(passed, 1)
+            if self._segment_row < self._segment_rows and passed:
+                self._segment_row = min(self._segment_row + passed, self._segment_rows)
+                hold[...] = self.segments[self._segment_start + self._segment_row - 1]
+                if self._segment_row == self._segment_rows:
+                    self._rest(hold)
+        self.tracker.setpoint[...] = hold
+
+    @staticmethod
+    def _rest(hold: np.ndarray) -> None:
+        """Keep position and relative position, drop everything that moves."""
+        kept = float(hold["position_m"][0]), float(hold["relative_position_m"][0])
+        hold[...] = np.zeros(1, SETPOINT)
+        hold["position_m"], hold["relative_position_m"] = kept
+
+    def _slow_down(self, passed: int) -> None:
+        """Bring the reference to rest at half the drive's own stopping deceleration."""
+        hold = self.tracker.hold
+        dt_s = passed * self._period_s
+        v = float(hold["velocity_m_per_s"][0])
+        step = self._stop_deceleration * dt_s
+        after = v - step if v > step else v + step if v < -step else 0.0
+        hold["position_m"] += 0.5 * (v + after) * dt_s
+        hold["velocity_m_per_s"] = after
+        hold["acceleration_m_per_s2"] = (after - v) / dt_s if after != 0.0 and dt_s > 0.0 else 0.0
+        hold["jerk_m_per_s3"] = 0.0
+        rate = float(hold["relative_velocity_m_per_s"][0])
+        hold["relative_position_m"] += rate * dt_s
+        hold["relative_velocity_m_per_s"] = 0.9 * rate if abs(rate) > 1e-6 else 0.0
+        hold["relative_acceleration_m_per_s2"] = 0.0
+
+    # ---- what remains ------------------------------------------------------------------------------------------
+
+    def _record(
+        self,
+        lateness_ns: int,
+        tick_ns: int,
+        sync_end_t_ns: int,
+        macro_word: int,
+        micro_word: int,
+        macro_payload: bytes,
+        micro_frame: tuple[int, bytes] | None,
+    ) -> None:
+        """Fill the row and count it in the ring."""
+        row, inbox, one = self.row, self.inbox, self.tracker.active
+        row[...] = self._fresh_row
+        fill_row(row, one.measurement, self.tracker.setpoint, one.command, one.model, one.law, one.backlash)
+        record = row[0]
+        record["run_phase"] = int(self.phase)
+        record["lateness_ns"] = lateness_ns
+        record["tick_ns"] = tick_ns
+        record["sync_end_t_ns"] = sync_end_t_ns
+        record["sensor_arrival_t_ns"] = inbox.sensor_arrival_t_ns
+        count = len(inbox.sensor_bytes)
+        record["sensor_bytes_count"] = count
+        if count:
+            record["sensor_bytes"][:count] = np.frombuffer(inbox.sensor_bytes, np.uint8)
+        for name in Inbox.FRAMES:
+            payload = getattr(inbox, name)
+            if payload is not None:
+                record[f"{name}_count"] = len(payload)
+                record[name][: len(payload)] = np.frombuffer(payload, np.uint8)
+        record["macro_controlword"] = macro_word
+        record["micro_controlword"] = micro_word
+        record["macro_rpdo"][: len(macro_payload)] = np.frombuffer(macro_payload, np.uint8)
+        if micro_frame is not None:
+            record["micro_rpdo"][: len(micro_frame[1])] = np.frombuffer(micro_frame[1], np.uint8)
+        record["macro_counts"] = self.decoder.macro_counts
+        record["end_counts"] = self.decoder.end_counts
+        record["air_index_ratio"] = self.decoder.air_index
+        record["homing_id"] = self._request["homing_id"][0]
+        record["samples_lost"] = self.decoder.samples_lost
+        record["cycles_missed"] = self._missed
+        record["law_number"] = self.tracker.law_number
+        record["segment_number"] = self._segment_number
+        record["update_number"] = self._update_number
+        self.ring.write(row)
+        self._rows += 1
+
+    def _publish(self, t_ns: int) -> None:
+        """Tell the supervisor where things stand."""
+        status, m, one = self._status[0], self.tracker.measurement[0], self.tracker.active
+        status["rows"] = self._rows
+        status["t_ns"] = t_ns
+        status["phase"] = int(self.phase)
+        status["stop"] = int(self.stop)
+        status["segment_number"] = self._segment_number
+        status["segment_left_rows"] = self._segment_rows - self._segment_row
+        status["update_number"] = self._update_number
+        status["sensor_ready"] = self._valid_samples >= _READY_SAMPLES and m["samples_new"] > 0
+        status["reference_lost"] = m["reference_lost"]
+        for name in (
+            "macro_statusword",
+            "micro_statusword",
+            "macro_position_m",
+            "end_position_m",
+            "macro_encoder_m",
+            "emergency",
+        ):
+            status[name] = m[name]
+        status["inputs"] = m["macro_digital_inputs"] | m["micro_digital_inputs"]
+        status["macro_counts"] = self.decoder.macro_counts
+        status["end_counts"] = self.decoder.end_counts
+        hold = self.tracker.hold[0]
+        status["setpoint_position_m"] = hold["position_m"]
+        status["setpoint_relative_position_m"] = hold["relative_position_m"]
+        status["error_m"] = m["end_position_m"] - self.tracker.setpoint[0]["position_m"]
+        estimate = one.backlash[0]
+        for side in ("left", "right"):
+            status[f"{side}_m"] = estimate[f"{side}_m"]
+            status[f"{side}_sd_m"] = estimate[f"{side}_sd_m"]
+            status[f"{side}_stiffness_n_per_m"] = estimate[f"{side}_stiffness_n_per_m"]
+            status[f"{side}_stiffness_sd_n_per_m"] = estimate[f"{side}_stiffness_sd_n_per_m"]
+        status["missed_cycles"] = self._missed
+        status["lost_samples"] = self.decoder.samples_lost
+        self.status.publish(self._status)

@@ -1,0 +1,531 @@
+"""The supervisor object: everything that commands, API and tests ask of a stage goes through it.
+
+Configures the drives, starts the servo, asks it by requests and segments, drains the ring into the run folder. It
+never computes a command and nothing that the servo waits for.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers import cia402
+from drivers.arming import DriveMapping, DriveSettings, configure
+from drivers.canopen_master import Master
+from stagectl import trajectory as trajectories
+from stagectl.backend import SEGMENT_ROWS, Backend, ServoLink
+from stagectl.errors import DriveError, LinkError, RequestError, TimingError
+from stagectl.plant import PLANT_PARAMETERS
+from stagectl.profile import Profile
+from stagectl.record import Recorder
+from stagectl.replay import describe_mapping
+from stagectl.requests import Mode, Phase
+from stagectl.signals import SETPOINT, STOP_TEXT, Stop
+from stagectl.tracker import LAW_NAMES
+
+_STEP_S = 0.02
+_SENSOR_TIMEOUT_S = 5.0
+_TOUCH_FREQUENCY_HZ = 0.7
+_TOUCH_S = 6.0
+_TOUCH_SHARE = 0.6  # of the touch force that the sweep aims at: the edges are not known yet
+_TOUCH_TRIES = 4
+_SWEEP_SHARE = 0.8
+_JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
+_PLAN_SHARE = 0.9  # of the profile's limits that planned moves use
+_JERK_TIME_S = 0.1
+_QUICK_STOP_HOLD, _QUICK_STOP_OFF = 6, 2
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class BacklashEstimate:
+    """Edges and stiffness of the joint, with standard deviations; x_b = macro minus end, in the run's zero."""
+
+    left_m: float
+    right_m: float
+    left_sd_m: float
+    right_sd_m: float
+    left_stiffness_n_per_m: float
+    right_stiffness_n_per_m: float
+    left_stiffness_sd_n_per_m: float
+    right_stiffness_sd_n_per_m: float
+
+    @property
+    def width_m(self) -> float:
+        """Distance of the edges."""
+        return self.left_m + self.right_m
+
+    @property
+    def centre_m(self) -> float:
+        """Middle of the gap on x_b."""
+        return 0.5 * (self.right_m - self.left_m)
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether both sides were touched long enough to say anything."""
+        return math.isfinite(self.left_sd_m) and math.isfinite(self.right_sd_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a motion ended, and which rows of the run hold it."""
+
+    name: str
+    stop: Stop
+    first_row: int
+    rows: int
+    backlash: BacklashEstimate | None = None
+
+    @property
+    def text(self) -> str:
+        """The sentence for the operator."""
+        return STOP_TEXT[self.stop]
+
+    @property
+    def finished(self) -> bool:
+        """Whether it came to its own end."""
+        return self.stop is Stop.FINISHED
+
+
+def drive_settings(profile: Profile, vendor_id: int | None) -> dict[str, DriveSettings]:
+    """Say what each drive must be and do."""
+    settings = {}
+    for axis_name in profile.axes:
+        axis = profile.axis(axis_name)
+        is_macro = axis_name == "macro"
+        step_m = axis.encoder_step_m if is_macro else getattr(axis, "encoder_step_m", None)
+        vendor = axis.identity.vendor_id if vendor_id is None else vendor_id
+        product = axis.identity.product_code if vendor_id is None else None
+        ramp = profile.macro.stop_deceleration_m_per_s2 / (step_m or profile.macro.encoder_step_m)
+        hold = profile.macro.standstill == "hold"
+        settings[axis_name] = DriveSettings(
+            node_id=axis.node_id,
+            eds_path=str(profile.eds_path(axis_name)),
+            identity=(vendor, product),
+            mode=profile.macro.mode if is_macro else "torque",
+            rated_torque_word=round(axis.rated_force_n * 1e3),
+            max_torque_word=round(axis.force_limit_n / axis.rated_force_n * 1e3),
+            quick_stop_deceleration_word=round(ramp),
+            quick_stop_option=_QUICK_STOP_HOLD if is_macro and hold else _QUICK_STOP_OFF,
+            heartbeat_ms=round(profile.trip.heartbeat_s * 1e3),
+            rpdo_deadline_ms=round(profile.trip.rpdo_deadline_s * 1e3),
+            cycle_us=round(1e6 / profile.cycle.rate_hz),
+            rated_current_word=round(axis.rated_current_a * 1e3),
+            encoder_step_m=step_m if is_macro else None,
+        )
+    return settings
+
+
+class Supervisor:
+    """One stage, one holder. Use as a context; leaving it brings the stage to rest and closes the run."""
+
+    def __init__(
+        self,
+        profile: Profile,
+        backend: Backend,
+        run_folder: Path,
+        progress: Progress = lambda what, share: None,
+        manifest: dict[str, Any] | None = None,
+    ):
+        """Hold the parts; nothing is touched before `connect`."""
+        self.profile, self.backend, self.folder = profile, backend, run_folder
+        self._progress = progress
+        self._manifest = dict(manifest or {})
+        self._master: Master | None = None
+        self._link: ServoLink | None = None
+        self._recorder: Recorder | None = None
+        self._counter = 0
+        self._segment_number = 0
+        self._segment_free = 0
+        self._update_number = 0
+        self._homing_id = 0
+        self._belief = np.zeros(1, PLANT_PARAMETERS)
+        self._holds_lease = False
+        self.mappings: dict[str, DriveMapping] = {}
+
+    def __enter__(self) -> "Supervisor":
+        self.connect()
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        self.close()
+
+    # ---- parts -----------------------------------------------------------------------------------------------
+
+    @property
+    def link(self) -> ServoLink:
+        """The servo; RequestError before `connect`."""
+        if self._link is None:
+            raise RequestError("the stage is not connected; call connect() first")
+        return self._link
+
+    @property
+    def master(self) -> Master:
+        """The CANopen master; RequestError before `connect`."""
+        if self._master is None:
+            raise RequestError("the stage is not connected; call connect() first")
+        return self._master
+
+    @property
+    def recorder(self) -> Recorder:
+        """The run's recorder; RequestError before `connect`."""
+        if self._recorder is None:
+            raise RequestError("the stage is not connected; call connect() first")
+        return self._recorder
+
+    def status(self) -> np.void:
+        """Return the servo's newest state (STATUS)."""
+        return self.link.status.read()[1][0]
+
+    # ---- time ------------------------------------------------------------------------------------------------
+
+    def pump(self, duration_s: float = _STEP_S) -> np.void:
+        """Let time pass: renew counter and lease, drain the ring; returns the newest state."""
+        link = self.link
+        self._counter += 1
+        lease_ns = round(self.profile.trip.lease_s * 1e9) if self._holds_lease else 0
+        link.requests.publish({"counter": self._counter, "lease_until_t_ns": link.now_t_ns() + lease_ns})
+        link.pass_time(duration_s)
+        self.recorder.append(link.rows.read_new())
+        return self.status()
+
+    def _wait(self, done: Callable[[np.void], bool], timeout_s: float, what: str, share: float = 0.0) -> np.void:
+        """Pump until `done`; a servo that stopped by itself ends the wait too; TimingError after the timeout."""
+        until_t_ns = self.link.now_t_ns() + round(timeout_s * 1e9)
+        while True:
+            status = self.pump()
+            if done(status) or status["phase"] == Phase.STOPPED:
+                return status
+            if self.link.now_t_ns() > until_t_ns:
+                raise TimingError(f"{what}: not done after {timeout_s:g} s; phase {Phase(int(status['phase'])).name}")
+            self._progress(what, share)
+
+    def _event(self, name: str, **fields: Any) -> None:
+        self.recorder.event(name, self.link.now_t_ns(), **fields)
+
+    # ---- arming ----------------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Configure and read back the drives, start the servo, wait for sensor and process data."""
+        profile = self.profile
+        self._progress("configuring the drives", 0.0)
+        master = Master(self.backend.network_bus(), synchronous=self.backend.synchronous, clock_s=self.backend.clock_s)
+        self._master = master
+        settings = drive_settings(profile, self.backend.vendor_id)
+        found = configure(master, list(settings.values()))
+        self.mappings = dict(zip(settings, found, strict=True))
+        manifest = {
+            **self._manifest,
+            "profile": profile.effective(),
+            "profile_path": str(profile.source_path),
+            "profile_sha256": profile.sha256,
+            "backend": self.backend.name,
+            "backend_description": self.backend.description,
+            "mappings": {axis: describe_mapping(mapping) for axis, mapping in self.mappings.items()},
+            "laws": list(LAW_NAMES),
+        }
+        self._recorder = Recorder(self.folder, manifest)
+        self._link = self.backend.start_servo(profile, self.mappings, self.folder)
+        self._belief[...] = self._link.tracker_belief
+        self._recorder.save_snapshot(self._link.snapshot)
+        master.nmt(0, "start")
+        self._request(mode=int(Mode.IDLE))
+        self._event("connected", backend=self.backend.name, profile=profile.name)
+        status = self._wait(lambda s: bool(s["sensor_ready"]), _SENSOR_TIMEOUT_S, "waiting for the interferometer")
+        if not status["sensor_ready"]:
+            raise LinkError("the interferometer sends no valid sample; check beam, port and format of the profile")
+
+    def _request(self, **fields: Any) -> None:
+        self._counter += 1
+        self.link.requests.publish({"counter": self._counter, **fields})
+
+    def _publish_update(self, macro_zero_counts: float, end_zero_counts: float) -> None:
+        """Have the servo take zeros and belief; the event holds them for replay."""
+        self._update_number += 1
+        names = PLANT_PARAMETERS.names or ()
+        belief = {name: float(self._belief[name][0]) for name in names}
+        self._event(
+            "update",
+            number=self._update_number,
+            macro_zero_counts=macro_zero_counts,
+            end_zero_counts=end_zero_counts,
+            belief={name: repr(value) for name, value in belief.items()},
+        )
+        self._request(
+            update_number=self._update_number,
+            homing_id=self._homing_id,
+            macro_zero_counts=macro_zero_counts,
+            end_zero_counts=end_zero_counts,
+            **{f"belief_{name}": value for name, value in belief.items()},
+        )
+        number = self._update_number
+        self._wait(lambda s: s["update_number"] == number, 2.0, "taking over zeros")
+
+    def enable(self, law: str | None = None) -> Stop:
+        """Enable both drives and hold where the stage is; returns why not, NONE when it holds."""
+        if self.status()["phase"] == Phase.TRACKING:
+            return Stop.NONE
+        self._holds_lease = True
+        self._request(mode=int(Mode.TRACK), law_number=LAW_NAMES.index(law or self.profile.control.law))
+        self.pump()
+        status = self._wait(lambda s: s["phase"] == Phase.TRACKING, 5.0, "enabling the drives")
+        return Stop(int(status["stop"]))
+
+    def disarm(self) -> Stop:
+        """Bring the stage to rest under the law, then take the power away."""
+        phase = self.status()["phase"]
+        if phase in (Phase.IDLE, Phase.HOMED_DRIVE):
+            return Stop.NONE
+        self._request(mode=int(Mode.STOP))
+        status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "stopping")
+        self._holds_lease = False
+        stop = Stop(int(status["stop"]))
+        if stop is Stop.OPERATOR:
+            self.acknowledge()
+        return stop
+
+    def acknowledge(self) -> None:
+        """Acknowledge why the servo stopped; enables nothing."""
+        self._request(mode=int(Mode.IDLE), acknowledge_number=self._counter + 1)
+        self._wait(lambda s: s["phase"] == Phase.IDLE, 2.0, "acknowledging")
+
+    def close(self) -> None:
+        """Rest, power off, rows to disk; safe to call after any failure."""
+        if self._link is not None and self._recorder is not None:
+            stop = Stop.NONE
+            try:
+                stop = self.disarm()
+                self.pump(0.1)
+            finally:
+                self._link.close()
+                self._recorder.append(self._link.rows.read_new())
+                self._recorder.close({"stop": stop.name, "text": STOP_TEXT[stop]})
+                self._link = None
+        if self._master is not None:
+            self._master.close()
+            self._master = None
+
+    # ---- homing ----------------------------------------------------------------------------------------------
+
+    def home(self) -> Outcome:
+        """Home the macro by its drive, set its laser, touch both edges, set the end's laser, centre."""
+        first_row = self.recorder.rows_count
+        stop = self._home_drive()
+        if stop is not Stop.NONE:
+            return Outcome("home", stop, first_row, self.recorder.rows_count - first_row)
+        status = self.pump(0.3)
+        macro_scale, end_scale = self._scales()
+        macro_zero = float(status["macro_counts"]) - float(status["macro_encoder_m"]) / macro_scale
+        # At rest without power the spring stands at its middle: end = macro there, until the edges say better.
+        end_zero = float(status["end_counts"]) - float(status["macro_encoder_m"]) / end_scale
+        self._homing_id += 1
+        self._publish_update(macro_zero, end_zero)
+        estimate = None
+        if self.profile.micro is not None:
+            stop = self.enable()
+            if stop is not Stop.NONE:
+                return Outcome("home", stop, first_row, self.recorder.rows_count - first_row)
+            outcome = self._touch()
+            estimate = outcome.backlash
+            if not outcome.finished or estimate is None:
+                return Outcome("home", outcome.stop, first_row, self.recorder.rows_count - first_row)
+            self.take_backlash(estimate)
+        self._event("homing", number=self._homing_id, macro_zero_counts=macro_zero, end_zero_counts=end_zero)
+        return Outcome("home", Stop.FINISHED, first_row, self.recorder.rows_count - first_row, estimate)
+
+    def _touch(self) -> Outcome:
+        """Sweep until both edges have been pressed; a first guess of the end's zero may be off by half the gap.
+
+        Without power the micro swings on its spring between the edges, so where it stood when the zero was taken
+        says little; the edge that was met says where the other one is.
+        """
+        for _ in range(_TOUCH_TRIES):
+            outcome = self.sweep(_TOUCH_FREQUENCY_HZ, _TOUCH_S, _TOUCH_SHARE, "touching both edges")
+            estimate = outcome.backlash
+            if not outcome.finished or estimate is None or estimate.identifiable:
+                return outcome
+            width_m = float(self._belief["left_m"][0]) + float(self._belief["right_m"][0])
+            known = {name: float(self._belief[name][0]) for name in _JOINT}
+            if math.isfinite(estimate.right_sd_m):
+                known["right_m"], known["left_m"] = estimate.right_m, width_m - estimate.right_m
+            elif math.isfinite(estimate.left_sd_m):
+                known["left_m"], known["right_m"] = estimate.left_m, width_m - estimate.left_m
+            else:
+                break
+            sds = {name: math.inf for name in BacklashEstimate.__dataclass_fields__ if "_sd" in name}
+            self.take_backlash(BacklashEstimate(**known, **sds))
+        raise DriveError(
+            f"homing: not both edges of the joint were touched in {_TOUCH_TRIES} sweeps at {_TOUCH_SHARE:.0%} of "
+            "backlash.touch_force_n; check backlash.left_m and right_m, micro.stroke_m and the voice coil"
+        )
+
+    def _scales(self) -> tuple[float, float]:
+        from drivers.wire import WireDecoder
+
+        decoder = WireDecoder(self.profile, self.mappings)
+        return decoder.macro_m_per_count, decoder.end_m_per_count
+
+    def _home_drive(self) -> Stop:
+        """Let the macro's drive find its index."""
+        homing, node = self.profile.macro.homing, self.profile.macro.node_id
+        step_m = self.profile.macro.encoder_step_m
+        self.disarm()
+        master = self.master
+        master.write(node, cia402.MODES_OF_OPERATION, 0, cia402.MODE_HOMING)
+        master.write(node, cia402.HOMING_METHOD, 0, homing.method)
+        master.write(node, cia402.HOMING_SPEEDS, 1, round(homing.speed_m_per_s / step_m))
+        master.write(node, cia402.HOMING_SPEEDS, 2, round(homing.speed_m_per_s / step_m))
+        master.write(node, cia402.HOMING_ACCELERATION, 0, round(homing.acceleration_m_per_s2 / step_m))
+        self._holds_lease = True
+        self.pump()
+        self._request(mode=int(Mode.HOME_DRIVE))
+        self.pump()
+        status = self._wait(lambda s: s["phase"] == Phase.HOMED_DRIVE, homing.timeout_s, "homing the macro")
+        stop = Stop(int(status["stop"]))
+        self._request(mode=int(Mode.IDLE))
+        if stop is Stop.NONE:
+            self._wait(
+                lambda s: cia402.state_of(int(s["macro_statusword"])) is cia402.State.SWITCH_ON_DISABLED, 5.0, "resting"
+            )
+            mode = cia402.MODE_CSP if self.profile.macro.mode == "position" else cia402.MODE_CST
+            master.write(node, cia402.MODES_OF_OPERATION, 0, mode)
+        return stop
+
+    def take_backlash(self, estimate: BacklashEstimate) -> None:
+        """Believe an identified backlash; the end's zero moves so that the gap's centre is where the profile has it."""
+        status = self.status()
+        macro_scale, end_scale = self._scales()
+        before_m = float(status["end_counts"]) * end_scale - float(status["end_position_m"])
+        centre_m = 0.5 * (float(self._belief["right_m"][0]) - float(self._belief["left_m"][0]))
+        # x_b = macro - end must grow by (centre - identified centre): the end's positions shrink by it
+        end_zero = (before_m + (centre_m - estimate.centre_m)) / end_scale
+        macro_zero = float(status["macro_counts"]) - float(status["macro_position_m"]) / macro_scale
+        self._belief["left_m"] = 0.5 * estimate.width_m - centre_m
+        self._belief["right_m"] = 0.5 * estimate.width_m + centre_m
+        self._belief["left_stiffness_n_per_m"] = estimate.left_stiffness_n_per_m
+        self._belief["right_stiffness_n_per_m"] = estimate.right_stiffness_n_per_m
+        self._publish_update(macro_zero, end_zero)
+
+    # ---- motion ----------------------------------------------------------------------------------------------
+
+    def follow(self, setpoints: np.ndarray, name: str, law: str | None = None) -> Outcome:
+        """Run a segment of SETPOINT rows that begins where the stage holds; returns how it ended."""
+        if setpoints.size > SEGMENT_ROWS:
+            raise RequestError(f"{name}: {setpoints.size} setpoints, {SEGMENT_ROWS} fit; split the trajectory")
+        status = self.status()
+        if status["phase"] != Phase.TRACKING:
+            raise RequestError(f"{name}: the stage is not armed; enable it first")
+        away_m = abs(float(setpoints["position_m"][0]) - float(status["setpoint_position_m"]))
+        if not away_m <= 1e-6:
+            raise RequestError(f"{name} begins {away_m:g} m from where the stage holds; move there first")
+        if self._segment_free + setpoints.size > SEGMENT_ROWS:
+            self._segment_free = 0
+        start = self._segment_free
+        self.link.segments[start : start + setpoints.size] = setpoints
+        self._segment_free += setpoints.size
+        self._segment_number += 1
+        number = self._segment_number
+        first_row = self.recorder.rows_count
+        fields: dict[str, Any] = {"segment_start": start, "segment_rows": setpoints.size, "segment_number": number}
+        if law is not None:
+            fields["law_number"] = LAW_NAMES.index(law)
+        self._event("segment", number=number, segment=name, law=law, setpoints=int(setpoints.size))
+        self._request(**fields)
+        duration_s = setpoints.size / self.profile.cycle.rate_hz
+        until_t_ns = self.link.now_t_ns() + round((duration_s * 1.5 + 5.0) * 1e9)
+        while True:
+            status = self.pump()
+            if status["phase"] != Phase.TRACKING:
+                status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "coming to rest")
+                stop = Stop(int(status["stop"]))
+                break
+            if status["segment_number"] == number and status["segment_left_rows"] <= 0:
+                stop = Stop.FINISHED
+                break
+            if self.link.now_t_ns() > until_t_ns:
+                raise TimingError(f"{name}: not done after {duration_s * 1.5 + 5.0:g} s; is the sensor's rate_hz right?")
+            self._progress(name, 1.0 - float(status["segment_left_rows"]) / setpoints.size)
+        self._event("segment_end", number=number, stop=stop.name)
+        return Outcome(name, stop, first_row, self.recorder.rows_count - first_row, self._backlash(status))
+
+    def _backlash(self, status: np.void) -> BacklashEstimate | None:
+        if self.profile.micro is None:
+            return None
+        return BacklashEstimate(
+            **{name: float(status[name]) for name in BacklashEstimate.__dataclass_fields__}  # named alike
+        )
+
+    def _limits(self) -> trajectories.Limits:
+        macro = self.profile.macro
+        acceleration = _PLAN_SHARE * min(macro.acceleration_limit_m_per_s2, 0.5 * macro.stop_deceleration_m_per_s2)
+        return trajectories.Limits(_PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S)
+
+    def move(self, target_m: float, law: str | None = None) -> Outcome:
+        """Move the end to a position, jerk-limited; checked before the first cycle."""
+        status = self.status()
+        start_m = float(status["setpoint_position_m"])
+        self._centre(status)
+        if abs(target_m - start_m) < 1e-12:
+            return Outcome("move", Stop.FINISHED, self.recorder.rows_count, 0)
+        planned = trajectories.move(start_m, target_m, self._limits(), 1.0 / self.profile.cycle.rate_hz)
+        self._check(planned)
+        return self.follow(planned.setpoints, f"moving to {target_m * 1e3:g} mm", law)
+
+    def _check(self, planned: trajectories.Trajectory) -> None:
+        macro = self.profile.macro
+        trajectories.check(
+            planned,
+            macro.travel_m,
+            macro.velocity_limit_m_per_s,
+            macro.acceleration_limit_m_per_s2,
+            stop_deceleration_m_per_s2=macro.stop_deceleration_m_per_s2,
+        )
+
+    def _centre(self, status: np.void) -> None:
+        """Bring the macro to the middle of the gap, the end at rest, by a fifth-order polynomial."""
+        relative_m = float(status["setpoint_relative_position_m"])
+        if abs(relative_m) < 1e-9:
+            return
+        duration_s = 1.0
+        count = round(duration_s * self.profile.cycle.rate_hz)
+        u = np.arange(1, count + 1) / count
+        rows = np.zeros(count, SETPOINT)
+        rows["position_m"] = status["setpoint_position_m"]
+        rows["relative_position_m"] = relative_m * (1 - (10 * u**3 - 15 * u**4 + 6 * u**5))
+        rows["relative_velocity_m_per_s"] = -relative_m * (30 * u**2 - 60 * u**3 + 30 * u**4) / duration_s
+        rows["relative_acceleration_m_per_s2"] = -relative_m * (60 * u - 180 * u**2 + 120 * u**3) / duration_s**2
+        self.follow(rows, "centring")
+
+    def run(self, planned: trajectories.Trajectory, law: str) -> Outcome:
+        """Move to a trajectory's start, then follow it under a law."""
+        self._check(planned)
+        there = self.move(float(planned.setpoints["position_m"][0]), law)
+        if not there.finished:
+            return there
+        return self.follow(planned.setpoints, f"{planned.name} under {law}", law)
+
+    def sweep(self, frequency_hz: float, duration_s: float, force_share: float, name: str) -> Outcome:
+        """Let the micro meet both edges, pressing with at most `force_share` of the touch force."""
+        if self.profile.micro is None or self.profile.backlash is None:
+            raise RequestError(f"{name}: this stage has no micro; there is no backlash to identify")
+        status = self.status()
+        self._centre(status)
+        stiffness = max(float(self._belief["left_stiffness_n_per_m"][0]), float(self._belief["right_stiffness_n_per_m"][0]))
+        width_m = float(self._belief["left_m"][0]) + float(self._belief["right_m"][0])
+        press_m = force_share * self.profile.backlash.touch_force_n / stiffness
+        planned = trajectories.sweep(
+            0.5 * width_m + press_m,
+            frequency_hz,
+            duration_s,
+            centre_m=float(status["setpoint_position_m"]),
+            dt_s=1.0 / self.profile.cycle.rate_hz,
+        )
+        return self.follow(planned.setpoints, name)
+
+    def identify(self, frequency_hz: float = 1.0, duration_s: float = 20.0) -> Outcome:
+        """Identify the backlash from a sweep over both contacts."""
+        return self.sweep(frequency_hz, duration_s, _SWEEP_SHARE, "identifying the backlash")
