@@ -176,7 +176,7 @@ class WireDecoder:
             m["sample_t_ns"][0] = sample_clock.sample_t_ns(self.clock, self.sequence)
             m["macro_position_m"][0] = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
             m["end_position_m"][0] = (self.end_counts - self.end_zero_counts) * self.end_m_per_count
-            if valid:
+            if valid and self.sequence == self.cycle:  # behind a late line the drive's position is of a later SYNC
                 self._compare_with_encoder(m)
         m["cycle"][0] = self.cycle
         m["reference_lost"][0] = self.reference_lost

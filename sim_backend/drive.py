@@ -126,8 +126,10 @@ class Drive:
             return ABORT_VALUE
         if object_key == HOMING_METHOD and value not in HOMING_METHODS:
             return ABORT_VALUE
-        if object_key in (QUICK_STOP_DECELERATION, HOMING_ACCELERATION, INTERPOLATION_VALUE) and value == 0:
+        if object_key == INTERPOLATION_VALUE and value == 0:
             return ABORT_VALUE
+        if object_key in (QUICK_STOP_DECELERATION, HOMING_ACCELERATION) and value == 0 and self.has_encoder:
+            return ABORT_VALUE  # without an encoder there is no ramp, and the value means nothing
         if object_key == RATED_CURRENT and (value == 0 or self.state in _POWERED):
             return ABORT_STATE if value else ABORT_VALUE
         return 0

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import canopen
-from canopen.sdo import SdoAbortedError
+from canopen.sdo.exceptions import SdoAbortedError
 
 from sim_backend import drive as cia402
 from sim_backend import object_dictionary, process_data
@@ -331,6 +331,12 @@ class DriveNode:
             self.drive.watch(current_a)
         self._after()
         return self._take()
+
+    def postpone_watches(self, span_ns: int) -> None:
+        """Move the deadlines of heartbeat, RPDO and SYNC: the time that the rig itself was held up is not silence."""
+        self._heartbeat_t_ns = min(_NEVER_NS, self._heartbeat_t_ns + span_ns)
+        self._rpdo_t_ns = min(_NEVER_NS, self._rpdo_t_ns + span_ns)
+        self._sync_t_ns = min(_NEVER_NS, self._sync_t_ns + span_ns)
 
     def set_inputs(self, inputs: int, t_ns: int) -> list[tuple[int, bytes]]:
         """Change the drive's digital inputs."""

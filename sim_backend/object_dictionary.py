@@ -33,19 +33,21 @@ def load(path: str | Path, node_id: int, axis: Any) -> canopen.ObjectDictionary:
     dictionary = canopen.import_od(str(path), node_id=node_id)
     rated_force_n = getattr(axis, "rated_force_n", None)
     step_m = getattr(axis, "encoder_step_m", None)
-    try:
-        dictionary[0x1018][1].default = RIG_VENDOR_ID
-        dictionary[0x6075].default = round(1000.0 * axis.rated_current_a)
-        if rated_force_n is not None:
-            dictionary[0x6076].default = round(1000.0 * rated_force_n)
-        if step_m is not None and 0x608F in dictionary:
-            dictionary[0x608F][1].default = round(1.0 / step_m)
-            dictionary[0x608F][2].default = 1
-    except KeyError as error:
-        raise ProfileError(
-            f"{path}: the EDS file lacks {error}; the rig needs 0x1018:01, 0x6075, 0x6076 and a whole 0x608F"
-        ) from error
+    _set_default(dictionary, path, 0x1018, 1, RIG_VENDOR_ID)
+    _set_default(dictionary, path, 0x6075, 0, round(1000.0 * axis.rated_current_a))
+    if rated_force_n is not None:
+        _set_default(dictionary, path, 0x6076, 0, round(1000.0 * rated_force_n))
+    if step_m is not None and 0x608F in dictionary:
+        _set_default(dictionary, path, 0x608F, 1, round(1.0 / step_m))
+        _set_default(dictionary, path, 0x608F, 2, 1)
     return dictionary
+
+
+def _set_default(dictionary: canopen.ObjectDictionary, path: str | Path, index: int, subindex: int, value: int) -> None:
+    variable = dictionary.get_variable(index, subindex)
+    if variable is None:
+        raise ProfileError(f"{path}: the EDS file lacks 0x{index:04X}:{subindex:02X}; the rig's drives need it, add it")
+    variable.default = value
 
 
 def numbers(dictionary: canopen.ObjectDictionary) -> dict[int, int]:

@@ -29,6 +29,7 @@ _PARENT_PERIOD_NS = 250_000_000
 _TRUTH_LIMIT_S = 900.0
 _PR_SET_TIMERSLACK = 29
 _IDLE_NS = 100_000_000
+_HELD_UP_NS = 1_000_000
 
 
 def _now_t_ns() -> int:
@@ -52,6 +53,7 @@ class RigProcess:
         self._delayed: list[tuple[int, int, int, bytes, int]] = []  # instant, number, id, payload, sender
         self._delayed_count = 0
         self._bus_was_off = False
+        self.rig.take_frames()  # boot-up: nobody is on the bus yet
 
     # -- loop ---------------------------------------------------------------------------------------------------------
 
@@ -71,6 +73,9 @@ class RigProcess:
             ready, _, _ = select.select([stop_fileno, *self.hub.filenos()], [], [], 1e-9 * wait_ns)
             if stop_fileno in ready:
                 return
+            late_ns = _now_t_ns() - now_t_ns - wait_ns
+            if late_ns > _HELD_UP_NS:  # a real drive is not held up by the host: this is no silence of its master
+                self.rig.postpone_watches(late_ns)
             for fileno in ready:
                 for sender, can_id, payload in self.hub.read(fileno):
                     self._pass(can_id, payload, sender)

@@ -203,6 +203,12 @@ class Rig:
                     self._collect(now_t_ns, node.on_time(now_t_ns, *self._motors()[k]))
             self._plan()
 
+    def postpone_watches(self, span_ns: int) -> None:
+        """Tell the drives that the rig was held up for so long by its host: their watches wait as much longer."""
+        for node in self.nodes:
+            node.postpone_watches(span_ns)
+        self._plan()
+
     # -- bus ----------------------------------------------------------------------------------------------------------
 
     def on_frame(self, can_id: int, payload: bytes, t_ns: int) -> list[tuple[int, bytes]]:

@@ -34,6 +34,8 @@ ESTIMATOR = np.dtype(
         ("micro_word", "f8"),
         ("macro_word_before", "f8"),  # latched by the SYNC before
         ("micro_word_before", "f8"),
+        ("macro_seen_m", "f8"),  # this cycle's positions: the sample, or its prediction where the line is late
+        ("end_seen_m", "f8"),
         ("macro_innovation_m", "f8"),
         ("end_innovation_m", "f8"),
     ]

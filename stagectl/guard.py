@@ -134,7 +134,8 @@ def _motion_stop(g, m, now):
         g.macro_velocity_m_per_s = now.velocity_m_per_s
         g.cycle = m.cycle
     elapsed = m.cycle - g.cycle
-    if elapsed > 0 and m.samples_new > 0:
+    fresh = m.samples_new > 0 and m.sequence == m.cycle
+    if elapsed > 0 and fresh:
         rate = (m.macro_position_m - g.macro_position_m) / (elapsed * g.period_s)
         g.macro_velocity_m_per_s += g.velocity_share * (rate - g.macro_velocity_m_per_s)
         g.macro_position_m = m.macro_position_m
@@ -147,7 +148,8 @@ def _motion_stop(g, m, now):
     rest_m = m.macro_position_m + 0.5 * v * abs(v) / g.stop_deceleration_m_per_s2
     if not g.travel_low_m <= rest_m <= g.travel_high_m:
         return _VELOCITY
-    if not abs(m.end_position_m - now.position_m) <= g.following_error_m:
+    # A late line leaves the position of the cycle before, a whole step behind; its age is watched by itself.
+    if fresh and not abs(m.end_position_m - now.position_m) <= g.following_error_m:
         return _FOLLOWING_ERROR
     if g.has_micro != 0.0 and not g.stroke_low_m <= m.end_position_m - m.macro_position_m <= g.stroke_high_m:
         return _MICRO_STROKE

@@ -1,6 +1,6 @@
-"""Copy what a tick knew and decided into its row, compiled: eighty fields in one call (field by field: 12 us).
+"""Copy what a cycle knew and decided into its row and into the status block, compiled: one call each.
 
-Pure; knows no memory and no clock.
+Field by field from Python the two cost 45 us a cycle (measured). Pure; knows no memory and no clock.
 """
 
 from stagectl import compose
@@ -27,15 +27,59 @@ _ESTIMATES = {
 }
 
 
-def _source() -> str:
-    """Write the copies out, one line a field: compiled code can't loop over names."""
+_LOOP = (
+    "run_phase",
+    "lateness_ns",
+    "tick_ns",
+    "sync_end_t_ns",
+    "sensor_arrival_t_ns",
+    "sensor_bytes_count",
+    "macro_controlword",
+    "micro_controlword",
+    "macro_counts",
+    "end_counts",
+    "law_number",
+    "segment_number",
+    "update_number",
+    "homing_id",
+    "samples_lost",
+    "cycles_missed",
+    "air_index_ratio",
+)
+"""What the loop itself adds to a row."""
+
+_STATED = (
+    "rows",
+    "phase",
+    "stop",
+    "segment_number",
+    "segment_left_rows",
+    "update_number",
+    "sensor_ready",
+    "missed_cycles",
+    "lost_samples",
+    "macro_counts",
+    "end_counts",
+)
+"""What the loop itself adds to the status."""
+
+_MEASURED = (
+    "t_ns",
+    "reference_lost",
+    "macro_statusword",
+    "micro_statusword",
+    "macro_position_m",
+    "end_position_m",
+    "macro_encoder_m",
+    "emergency",
+)
+
+
+def _row_source() -> list[str]:
+    """Write the copies of a row out, one line a field: compiled code can't loop over names."""
     lines = [
-        '"""Generated: the copies of a row."""',
-        "from stagectl.compiled import compiled",
-        "",
-        "",
         "@compiled",
-        "def fill_row(row, measurement, setpoint, command, model, law, backlash):",
+        f"def fill_row(row, measurement, setpoint, command, model, law, backlash, {', '.join(_LOOP)}):",
         "    r = row[0]",
         "    m = measurement[0]",
         "    t = setpoint[0]",
@@ -48,8 +92,49 @@ def _source() -> str:
     lines += [f"    r.setpoint_{name} = t.{name}" for name in SETPOINT.names or ()]
     lines += [f"    r.{name} = c.{name}" for name in COMMAND.names or ()]
     lines += [f"    r.{name} = {value}" for name, value in _ESTIMATES.items()]
-    return "\n".join(lines) + "\n"
+    lines += [f"    r.{name} = {name}" for name in _LOOP]
+    return lines
 
 
-fill_row = compose.generated_module("row", _source()).fill_row
-"""fill_row(row, measurement, setpoint, command, model, law, backlash): all one-element arrays."""
+def _status_source() -> list[str]:
+    """Write the copies of a status out."""
+    lines = [
+        "@compiled",
+        f"def fill_status(status, measurement, setpoint, hold, backlash, {', '.join(_STATED)}):",
+        "    r = status[0]",
+        "    m = measurement[0]",
+        "    b = backlash[0]",
+    ]
+    lines += [f"    r.{name} = m.{name}" for name in _MEASURED]
+    lines += [f"    r.{name} = {name}" for name in _STATED]
+    lines += ["    r.inputs = m.macro_digital_inputs | m.micro_digital_inputs"]
+    lines += ["    r.setpoint_position_m = hold[0].position_m"]
+    lines += ["    r.setpoint_relative_position_m = hold[0].relative_position_m"]
+    lines += ["    r.error_m = m.end_position_m - setpoint[0].position_m"]
+    for side in ("left", "right"):
+        for name in ("m", "sd_m", "stiffness_n_per_m", "stiffness_sd_n_per_m"):
+            lines.append(f"    r.{side}_{name} = b.{side}_{name}")
+    return lines
+
+
+_MODULE = compose.generated_module(
+    "row",
+    "\n".join(
+        [
+            '"""Generated: the copies of a row and of a status."""',
+            "from stagectl.compiled import compiled",
+            "",
+            "",
+            *_row_source(),
+            "",
+            "",
+            *_status_source(),
+            "",
+        ]
+    ),
+)
+
+fill_row = _MODULE.fill_row
+"""fill_row(row, measurement, setpoint, command, model, law, backlash, ...): one-element arrays, then `_LOOP`."""
+fill_status = _MODULE.fill_status
+"""fill_status(status, measurement, setpoint, hold, backlash, ...): one-element arrays, then `_STATED`."""

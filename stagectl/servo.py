@@ -15,8 +15,8 @@ from drivers import cia402
 from drivers.wire import HEARTBEAT_FRAME, SYNC_FRAME, Inbox, WireDecoder, WireEncoder
 from stagectl.requests import REQUEST, STATUS, Mode, Phase
 from stagectl.ring import RequestReader, RequestWriter, RingWriter
-from stagectl.row import new_rows
-from stagectl.row_fill import fill_row
+from stagectl.row import FRAME_BYTES_COUNT, ROW, new_rows
+from stagectl.row_fill import fill_row, fill_status
 from stagectl.signals import COMMAND, SETPOINT, Stop
 from stagectl.tracker import Tracker, belief_of
 
@@ -25,6 +25,9 @@ _QUICK_STOP_TIMEOUT_S = 5.0
 _HEARTBEATS_PER_TIMEOUT = 4
 _REST_M_PER_S = 1e-3
 _READY_SAMPLES = 200  # before the sample clock counts as locked: 60 us / 200 = 0.3 us
+
+
+_LENGTHS = tuple(count.to_bytes(8, "little") for count in range(FRAME_BYTES_COUNT + 1))
 
 
 class Transport(Protocol):
@@ -67,7 +70,11 @@ class Servo:
         self._clock_ns = clock_ns
         self.inbox = Inbox()
         self.row = new_rows(1)
-        self._fresh_row = new_rows(1)
+        self._row_bytes = memoryview(self.row).cast("B")
+        self._fresh_bytes = new_rows(1).tobytes()
+        fields = ROW.fields or {}
+        self._offsets = {name: fields[name][1] for name in ROW.names or ()}
+        self._homing_id = 0
         self._status = np.zeros(1, STATUS)
         self._request = np.zeros(1, REQUEST)
         self._has_micro = profile.micro is not None
@@ -144,7 +151,7 @@ class Servo:
         sent, sync_end_t_ns = self.transport.send(frames)
         self._command_lost = 0 if sent else 1
         self._record(lateness_ns, tick_ns, sync_end_t_ns, macro_word, micro_word, macro_frame[1], micro_frame)
-        self._publish(t_ns)
+        self._publish()
         self._plan_next(t_ns)
 
     def _plan_next(self, t_ns: int) -> None:
@@ -164,7 +171,7 @@ class Servo:
     def _read_request(self, t_ns: int) -> None:
         """Take the newest request; notice a supervisor that stands still."""
         _, request = self.requests.read()
-        self._request[...] = request
+        self._request = request
         counter = int(request["counter"][0])
         if counter != self._counter:
             self._counter, self._counter_t_ns = counter, t_ns
@@ -175,6 +182,7 @@ class Servo:
             self.tracker.measurement["end_position_m"] += shifts[1]
             self.tracker.update(belief_of(request), *shifts)
             self._update_number = number
+            self._homing_id = int(request["homing_id"][0])
 
     def _enter(self, phase: Phase, t_ns: int) -> None:
         self.phase = phase
@@ -336,75 +344,44 @@ class Servo:
         micro_frame: tuple[int, bytes] | None,
     ) -> None:
         """Fill the row and count it in the ring."""
-        row, inbox, one = self.row, self.inbox, self.tracker.active
-        row[...] = self._fresh_row
-        fill_row(row, one.measurement, self.tracker.setpoint, one.command, one.model, one.law, one.backlash)
-        record = row[0]
-        record["run_phase"] = int(self.phase)
-        record["lateness_ns"] = lateness_ns
-        record["tick_ns"] = tick_ns
-        record["sync_end_t_ns"] = sync_end_t_ns
-        record["sensor_arrival_t_ns"] = inbox.sensor_arrival_t_ns
+        inbox, one, decoder, tracker = self.inbox, self.tracker.active, self.decoder, self.tracker
+        bytes_ = self._row_bytes
+        bytes_[:] = self._fresh_bytes
         count = len(inbox.sensor_bytes)
-        record["sensor_bytes_count"] = count
+        fill_row(
+            self.row, one.measurement, tracker.setpoint, one.command, one.model, one.law, one.backlash,
+            int(self.phase), lateness_ns, tick_ns, sync_end_t_ns, inbox.sensor_arrival_t_ns, count,
+            macro_word, micro_word, decoder.macro_counts, decoder.end_counts, tracker.law_number,
+            self._segment_number, self._update_number, self._homing_id, decoder.samples_lost, self._missed,
+            decoder.air_index,
+        )  # fmt: skip
+        at = self._offsets
         if count:
-            record["sensor_bytes"][:count] = np.frombuffer(inbox.sensor_bytes, np.uint8)
+            start = at["sensor_bytes"]
+            bytes_[start : start + count] = inbox.sensor_bytes
         for name in Inbox.FRAMES:
             payload = getattr(inbox, name)
             if payload is not None:
-                record[f"{name}_count"] = len(payload)
-                record[name][: len(payload)] = np.frombuffer(payload, np.uint8)
-        record["macro_controlword"] = macro_word
-        record["micro_controlword"] = micro_word
-        record["macro_rpdo"][: len(macro_payload)] = np.frombuffer(macro_payload, np.uint8)
+                start = at[name]
+                bytes_[start : start + len(payload)] = payload
+                start = at[f"{name}_count"]
+                bytes_[start : start + 8] = _LENGTHS[len(payload)]
+        start = at["macro_rpdo"]
+        bytes_[start : start + len(macro_payload)] = macro_payload
         if micro_frame is not None:
-            record["micro_rpdo"][: len(micro_frame[1])] = np.frombuffer(micro_frame[1], np.uint8)
-        record["macro_counts"] = self.decoder.macro_counts
-        record["end_counts"] = self.decoder.end_counts
-        record["air_index_ratio"] = self.decoder.air_index
-        record["homing_id"] = self._request["homing_id"][0]
-        record["samples_lost"] = self.decoder.samples_lost
-        record["cycles_missed"] = self._missed
-        record["law_number"] = self.tracker.law_number
-        record["segment_number"] = self._segment_number
-        record["update_number"] = self._update_number
-        self.ring.write(row)
+            start = at["micro_rpdo"]
+            bytes_[start : start + len(micro_frame[1])] = micro_frame[1]
+        self.ring.write(self.row)
         self._rows += 1
 
-    def _publish(self, t_ns: int) -> None:
+    def _publish(self) -> None:
         """Tell the supervisor where things stand."""
-        status, m, one = self._status[0], self.tracker.measurement[0], self.tracker.active
-        status["rows"] = self._rows
-        status["t_ns"] = t_ns
-        status["phase"] = int(self.phase)
-        status["stop"] = int(self.stop)
-        status["segment_number"] = self._segment_number
-        status["segment_left_rows"] = self._segment_rows - self._segment_row
-        status["update_number"] = self._update_number
-        status["sensor_ready"] = self._valid_samples >= _READY_SAMPLES and m["samples_new"] > 0
-        status["reference_lost"] = m["reference_lost"]
-        for name in (
-            "macro_statusword",
-            "micro_statusword",
-            "macro_position_m",
-            "end_position_m",
-            "macro_encoder_m",
-            "emergency",
-        ):
-            status[name] = m[name]
-        status["inputs"] = m["macro_digital_inputs"] | m["micro_digital_inputs"]
-        status["macro_counts"] = self.decoder.macro_counts
-        status["end_counts"] = self.decoder.end_counts
-        hold = self.tracker.hold[0]
-        status["setpoint_position_m"] = hold["position_m"]
-        status["setpoint_relative_position_m"] = hold["relative_position_m"]
-        status["error_m"] = m["end_position_m"] - self.tracker.setpoint[0]["position_m"]
-        estimate = one.backlash[0]
-        for side in ("left", "right"):
-            status[f"{side}_m"] = estimate[f"{side}_m"]
-            status[f"{side}_sd_m"] = estimate[f"{side}_sd_m"]
-            status[f"{side}_stiffness_n_per_m"] = estimate[f"{side}_stiffness_n_per_m"]
-            status[f"{side}_stiffness_sd_n_per_m"] = estimate[f"{side}_stiffness_sd_n_per_m"]
-        status["missed_cycles"] = self._missed
-        status["lost_samples"] = self.decoder.samples_lost
+        one, decoder = self.tracker.active, self.decoder
+        ready = self._valid_samples >= _READY_SAMPLES and one.measurement["samples_new"][0] > 0
+        fill_status(
+            self._status, one.measurement, self.tracker.setpoint, self.tracker.hold, one.backlash,
+            self._rows, int(self.phase), int(self.stop), self._segment_number,
+            self._segment_rows - self._segment_row, self._update_number, int(ready), self._missed,
+            decoder.samples_lost, decoder.macro_counts, decoder.end_counts,
+        )  # fmt: skip
         self.status.publish(self._status)

@@ -26,6 +26,8 @@ def estimate(m, e, model, ahead, b, q, p):
     if x.started == 0.0:
         if m.samples_new > 0:
             estimator.start(x, s, m)
+            x.macro_seen_m = m.macro_position_m
+            x.end_seen_m = m.end_position_m
     elif m.cycle > x.cycle:
         if m.command_lost != 0:
             x.macro_word = x.macro_word_before
@@ -53,10 +55,10 @@ def estimate(m, e, model, ahead, b, q, p):
             x.predicted_samples = 0.0
         else:
             x.predicted_samples += 1.0
+        macro_m = m.macro_position_m if fresh else s.macro_position_m
+        end_m = m.end_position_m if fresh else s.end_position_m
         if q[0].has_micro != 0.0 and x.predicted_samples <= x.predicted_samples_max:
             # A line that comes late is one in twenty: its place is filled by what was predicted (a few nm off).
-            macro_m = m.macro_position_m if fresh else s.macro_position_m
-            end_m = m.end_position_m if fresh else s.end_position_m
             relative_m = end_m - macro_m
             rate = s.end_velocity_m_per_s - s.macro_velocity_m_per_s
             mean_n += forces.micro_actuator(end_m, s.end_velocity_m_per_s, relative_m, rate,
@@ -64,6 +66,8 @@ def estimate(m, e, model, ahead, b, q, p):
             mean_n += forces.micro_force(end_m, s.end_velocity_m_per_s, relative_m, rate,
                                          s.micro_current_a, mean_n, mean_n, s.t_s, p)
             backlash.step(b[0], m.cycle, macro_m, end_m, mean_n, q[0])
+        x.macro_seen_m = macro_m
+        x.end_seen_m = end_m
     ahead[0] = model[0]
     plant_module.advance(ahead, q, p, s.t_s + x.actuation_delay_s, x.longest_substep_s,
                          x.macro_word * x.macro_amperes_per_word, x.micro_word * x.micro_amperes_per_word, 1, 1)
@@ -87,7 +91,7 @@ def decide(m, now, later, e, ahead, after, l, q, p):
         joint_n = plant.joint_force(f, q[0], contact_n)
         known_n = joint_n + forces.micro_force(f.middle_end_position_m, f.middle_end_velocity_m_per_s, relative_m,
                                                rate, f.micro_current_a, f.micro_force_n, f.micro_force_n, f.t_s, p)
-        micro_n = law.precision(l[0], a, f, m, now, later, q[0].micro_mass_kg, known_n, a.micro_disturbance_n,
+        micro_n = law.precision(l[0], a, f, x, now, later, q[0].micro_mass_kg, known_n, a.micro_disturbance_n,
                                 q[0], x.period_s)
         felt_n = micro_n
         micro_n -= forces.micro_actuator(f.middle_end_position_m, f.middle_end_velocity_m_per_s, relative_m, rate,
@@ -99,12 +103,12 @@ def decide(m, now, later, e, ahead, after, l, q, p):
             macro_n = q[0].macro_mass_kg * (later.acceleration_m_per_s2 - later.relative_acceleration_m_per_s2)
             macro_n -= macro_known_n
         else:
-            macro_n = law.carrier(l[0], a, f, m, now, later, q[0].macro_mass_kg, macro_known_n,
+            macro_n = law.carrier(l[0], a, f, x, now, later, q[0].macro_mass_kg, macro_known_n,
                                   a.macro_disturbance_n, q[0], x.period_s)
     else:
         macro_known_n += forces.macro_force(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s, 0.0, 0.0,
                                             f.macro_current_a, f.macro_force_n, 0.0, f.t_s, p)
-        macro_n = law.precision(l[0], a, f, m, now, later, q[0].macro_mass_kg, macro_known_n, a.macro_disturbance_n,
+        macro_n = law.precision(l[0], a, f, x, now, later, q[0].macro_mass_kg, macro_known_n, a.macro_disturbance_n,
                                 q[0], x.period_s)
     macro_n -= forces.macro_actuator(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s, relative_m, rate,
                                      f.macro_current_a, macro_n, micro_n, f.t_s, p)

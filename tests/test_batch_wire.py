@@ -1,5 +1,6 @@
 """The wire in virtual time: instants, load, order, faults, determinism, and the drivers' own master on it."""
 
+import math
 import struct
 import time
 
@@ -9,7 +10,7 @@ import pytest
 from sim_backend.batch import BatchWire, attach_all
 from sim_backend.bus_load import frame_bits
 from sim_backend.faults import Fault
-from sim_backend.machine import load_machine
+from sim_backend.machine import list_machines, load_machine
 from sim_backend.rig import Rig, warm
 from stagectl.errors import LinkError
 
@@ -61,6 +62,7 @@ def arm(wire: BatchWire) -> None:
             sdo_write(wire, node_id, communication, 1, cob_id - 1 + node_id, 4)
         sdo_write(wire, node_id, 0x6060, 0, 10, 1)
         sdo_write(wire, node_id, 0x6007, 0, 3, 2)
+        sdo_write(wire, node_id, 0x605A, 0, 6, 2)
         sdo_write(wire, node_id, 0x1400, 5, 10, 2)
     wire.network_bus.send(can.Message(arbitration_id=0, data=[1, 0], is_extended_id=False))
 
@@ -258,6 +260,20 @@ def test_listeners_hear_synchronously(machine, wire_of):
     boot_up, answer = heard[:2], heard[2]
     assert [message.arbitration_id for message in boot_up] == [0x701, 0x702]
     assert answer.data.hex() == "4318100154520000"
+
+
+@pytest.mark.parametrize("name", list_machines())
+def test_every_machine_runs(name, wire_of):
+    machine = load_machine(name)
+    wire = wire_of(machine)
+    for node in wire.rig.nodes:
+        sdo_write(wire, node.node_id, 0x1017, 0, 50, 2)
+    wire.advance_to(wire.t_ns + 200 * MS)
+    assert len(wire.serial.read()) > 190 * 6
+    state = wire.rig.plant_state()
+    assert all(math.isfinite(value) for value in state.values())
+    assert abs(state["macro_position_m"] - machine.start.macro_position_m) < 1e-3
+    assert wire.bus.frames_count == 5 * len(wire.rig.nodes)  # the first heartbeat came with the SDO
 
 
 def test_the_drivers_master_arms_the_rig(machine, wire_of):

@@ -407,6 +407,17 @@ def stopping_distance_after_push(bench: Bench) -> tuple[float, float]:
     return bench.rig.plant_state()["macro_position_m"] - begin, seconds
 
 
+def test_time_that_the_rig_was_held_up_is_no_silence(bench):
+    bench.arm(deadline_ms=10)
+    bench.enable()
+    bench.wait(8)
+    bench.rig.postpone_watches(5 * MS)
+    bench.wait(6)
+    assert bench.rig.drive(1).state == S.OPERATION_ENABLED
+    bench.wait(2)
+    assert bench.rig.drive(1).state == S.QUICK_STOP_ACTIVE
+
+
 def test_a_missing_heartbeat_stops_the_drive(bench):
     bench.arm()
     bench.write(1, 0x1016, 1, 0x7E << 16 | 40, 4)

@@ -100,7 +100,7 @@ def middle(after, later, q, law, dt_s):
 
 
 @compiled
-def precision(law, ahead, after, m, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
+def precision(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
     """Return the force of the axis that carries the end, N."""
     known_n += disturbance_n
     acceleration = later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3
@@ -145,7 +145,7 @@ def precision(law, ahead, after, m, now, later, mass_kg, known_n, disturbance_n,
 
 
 @compiled
-def carrier(law, ahead, after, m, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
+def carrier(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
     """Return the force of the macro that keeps the end in the middle of the gap, N."""
     known_n += disturbance_n
     e = ahead.macro_position_m - (later.position_m - later.relative_position_m + gap_centre(q))

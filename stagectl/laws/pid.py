@@ -76,9 +76,9 @@ def middle(after, later, q, law, dt_s):
 
 
 @compiled
-def precision(law, ahead, after, m, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
+def precision(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
     """Return the force of the axis that carries the end, N."""
-    error = now.position_m - m.end_position_m
+    error = now.position_m - seen.end_seen_m
     if law.started == 0.0:
         law.precision_error_m = error
         law.started = 1.0
@@ -101,9 +101,9 @@ def precision(law, ahead, after, m, now, later, mass_kg, known_n, disturbance_n,
 
 
 @compiled
-def carrier(law, ahead, after, m, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
+def carrier(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
     """Return the force of the macro that keeps the end in the middle of the gap, N."""
-    error = now.position_m - now.relative_position_m + gap_centre(q) - m.macro_position_m
+    error = now.position_m - now.relative_position_m + gap_centre(q) - seen.macro_seen_m
     if law.macro_started == 0.0:
         law.macro_error_m = error
         law.macro_started = 1.0
