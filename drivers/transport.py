@@ -12,6 +12,7 @@ from drivers.wire import Inbox
 from stagectl.errors import LinkError
 
 _CHUNK_LIMIT_BYTES = 512  # what one row can hold; the rest comes with the next cycle
+_POLL_NS = 1_000_000
 _BUS_OFF = 0x40  # linux/can/error.h
 
 
@@ -21,13 +22,18 @@ def now_t_ns() -> int:
 
 
 class RealtimeTransport:
-    """Waits for the next cycle and stamps what arrives meanwhile; LinkError where bus or port is gone."""
+    """Waits for the next cycle and stamps what arrives meanwhile.
+
+    A port or bus that is gone does not end the cycles: `failure` says so, and the servo stops the stage.
+    """
 
     def __init__(self, bus: CyclicBus, port: SerialPort, names: dict[int, str]):
         """Take over bus and port; `names` gives the inbox slot of each CAN id."""
         self._bus, self._port, self._names = bus, port, names
         self._poll = select.poll()
         self._poll.register(port.fileno(), select.POLLIN)
+        self._kept = b""  # read already, but beyond what one row holds
+        self.failure = ""
         self.error_frames_count = 0
 
     @property
@@ -41,33 +47,50 @@ class RealtimeTransport:
 
     def receive(self, deadline_t_ns: int, inbox: Inbox) -> int:
         """Wait until the deadline, stamping sensor bytes as they become readable; then take the bus's frames."""
+        inbox.sensor_bytes, self._kept = self._kept, b""
         while (left_ns := deadline_t_ns - now_t_ns()) > 0:
-            if len(inbox.sensor_bytes) >= _CHUNK_LIMIT_BYTES:
+            # poll counts in whole milliseconds and rounds up: the last stretch is slept
+            if self._kept or left_ns < _POLL_NS and not self._poll.poll(0):
                 time.sleep(left_ns * 1e-9)
-            elif self._poll.poll(left_ns * 1e-6):
-                inbox.sensor_arrival_t_ns = now_t_ns()
+            elif self._poll.poll(left_ns // _POLL_NS):
                 self._read(inbox)
-        if len(inbox.sensor_bytes) < _CHUNK_LIMIT_BYTES and self._poll.poll(0):
-            inbox.sensor_arrival_t_ns = now_t_ns()
+        while not self._kept and self._poll.poll(0):
             self._read(inbox)
-        while (frame := self._bus.receive()) is not None:
-            can_id, payload = frame
-            if can_id & ERROR_FLAG:
-                self.error_frames_count += 1
-                if can_id & _BUS_OFF:
-                    raise LinkError("CAN controller is bus-off: check cable, termination and bit rate, then arm again")
-                continue
-            setattr(inbox, self._names[can_id], payload)
+        try:
+            while (frame := self._bus.receive()) is not None:
+                self._take(frame, inbox)
+        except LinkError as error:
+            self.failure = str(error)
         return now_t_ns()
 
+    def _take(self, frame: tuple[int, bytes], inbox: Inbox) -> None:
+        can_id, payload = frame
+        if can_id & ERROR_FLAG:
+            self.error_frames_count += 1
+            if can_id & _BUS_OFF:
+                self.failure = "CAN controller is bus-off: check cable, termination and bit rate, then arm again"
+            return
+        setattr(inbox, self._names[can_id], payload)
+
     def _read(self, inbox: Inbox) -> None:
-        inbox.sensor_bytes += self._port.read(_CHUNK_LIMIT_BYTES - len(inbox.sensor_bytes))
+        inbox.sensor_arrival_t_ns = now_t_ns()
+        try:
+            data = inbox.sensor_bytes + self._port.read()
+        except LinkError as error:
+            self.failure = str(error)
+            self._poll.unregister(self._port.fileno())
+            return
+        inbox.sensor_bytes, self._kept = data[:_CHUNK_LIMIT_BYTES], data[_CHUNK_LIMIT_BYTES:]
 
     def send(self, frames: list[tuple[int, bytes]]) -> tuple[bool, int]:
         """Queue frames in this order; a full queue is a missed command, never sent again."""
         sent = True
-        for can_id, payload in frames:
-            sent &= self._bus.send(can_id, payload)
+        try:
+            for can_id, payload in frames:
+                sent &= self._bus.send(can_id, payload)
+        except LinkError as error:
+            self.failure = str(error)
+            sent = False
         return sent, now_t_ns()
 
     def close(self) -> None:

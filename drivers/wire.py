@@ -23,6 +23,7 @@ HEARTBEAT_FRAME = (0x700 + SERVO_NODE_ID, b"\x05")
 SYNC_FRAME = (SYNC_ID, b"")
 
 BOTH_VALID = MACRO_VALID | END_VALID
+_DISAGREEMENTS_IN_A_ROW = 5  # a host that holds a SYNC up by a millisecond is no lost reference
 _EARLIEST_SHARE = 0.5  # of the transport's constant part: no line of a sample younger than this can be there
 
 
@@ -33,6 +34,7 @@ class Inbox:
     t_ns: int = 0
     sensor_bytes: bytes = b""
     sensor_arrival_t_ns: int = 0
+    sync_t_ns: int = 0  # end of the last SYNC: when the drives sampled what their TPDOs carry
     macro_tpdo: bytes | None = None
     micro_tpdo: bytes | None = None
     macro_inputs_tpdo: bytes | None = None
@@ -89,7 +91,7 @@ class WireDecoder:
         self.samples_lost = 0
         self._compared_sequence = -2
         self._compared_m = 0.0
-        self._sync_share = profile.cycle.actuation_delay_s * sensor.rate_hz
+        self._disagreements = 0
         self._earliest_ns = _EARLIEST_SHARE * sensor.transport_s * 1e9
         self._jump_m = sensor.jump_limit_m
         self._disagreement_m = sensor.encoder_disagreement_m
@@ -177,20 +179,25 @@ class WireDecoder:
             m["macro_position_m"][0] = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
             m["end_position_m"][0] = (self.end_counts - self.end_zero_counts) * self.end_m_per_count
             if valid and self.sequence == self.cycle:  # behind a late line the drive's position is of a later SYNC
-                self._compare_with_encoder(m)
+                self._compare_with_encoder(m, inbox.sync_t_ns)
         m["cycle"][0] = self.cycle
         m["reference_lost"][0] = self.reference_lost
 
-    def _compare_with_encoder(self, m: np.ndarray) -> None:
-        """Latch *reference lost* where laser and drive disagree, both at the instant of the last SYNC.
+    def _compare_with_encoder(self, m: np.ndarray, sync_t_ns: int) -> None:
+        """Latch *reference lost* where laser and drive disagree for several cycles, both at the last SYNC's instant.
 
         The drive sampled its encoder between the last two laser samples: at 0.2 m/s that is 90 um away.
         """
         macro_m = float(m["macro_position_m"][0])
         if self.encoder_trusted and self.sequence == self._compared_sequence + 1 and m["tpdos_new"][0] & 1:
-            laser_m = self._compared_m + self._sync_share * (macro_m - self._compared_m)
-            if not abs(laser_m - float(m["macro_encoder_m"][0])) <= self._disagreement_m:
-                self.reference_lost = 1
+            since_ns = int(m["sample_t_ns"][0]) - sync_t_ns
+            laser_m = macro_m - (macro_m - self._compared_m) * (since_ns / self.period_ns)
+            if abs(laser_m - float(m["macro_encoder_m"][0])) <= self._disagreement_m:
+                self._disagreements = 0
+            else:
+                self._disagreements += 1
+                if self._disagreements >= _DISAGREEMENTS_IN_A_ROW:
+                    self.reference_lost = 1
         self._compared_sequence = self.sequence
         self._compared_m = macro_m
 
@@ -203,6 +210,7 @@ class WireDecoder:
         self.reference_lost = 0
         self.encoder_trusted = True
         self._compared_sequence = -2
+        self._disagreements = 0
         return macro_shift_m, end_shift_m
 
     def next_start_t_ns(self, phase_ns: float) -> int:
@@ -223,6 +231,7 @@ class WireDecoder:
         "samples_lost",
         "_compared_sequence",
         "_compared_m",
+        "_disagreements",
     )
 
     def snapshot(self) -> dict[str, np.ndarray]:

@@ -35,6 +35,7 @@ class Motor(Table):
     supply_v: Annotated[float, above(0.0, 2e3)]
     current_limit_a: Annotated[float, above(0.0, 1e4)]
     rated_current_a: Annotated[float, above(0.0, 1e3)]
+    rated_force_n: Annotated[float, above(0.0, 1e5)] | None = None  # the drive's name plate; None = the EDS's value
     current_loop_s: Annotated[float, within(1e-6, 0.02)]
     force_noise_n: Annotated[float, within(0.0, 1e3)] = 0.0  # rms, held for a millisecond
     stop_stiffness_n_per_m: Stiffness

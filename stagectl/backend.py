@@ -3,6 +3,15 @@
 Everything above sees a master's bus, an identity to demand, and a servo that runs when time passes.
 """
 
+import json
+import os
+import secrets
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +21,16 @@ import can
 import numpy as np
 
 from drivers.arming import DriveMapping
+from drivers.can_bus import connect_hub, open_network
+from drivers.transport import now_t_ns
 from drivers.wire import Inbox, WireDecoder, WireEncoder, frame_names
 from sim_backend.batch import BatchWire
 from sim_backend.rig import Rig
+from stagectl import estimator
+from stagectl.errors import DriveError, LinkError, ProfileError, RecordError, TimingError
 from stagectl.profile import Profile
-from stagectl.requests import REQUEST, STATUS
+from stagectl.replay import describe_mapping
+from stagectl.requests import REQUEST, STATUS, Mode
 from stagectl.ring import RequestReader, RequestWriter, RingReader, RingWriter
 from stagectl.servo import Servo
 from stagectl.signals import SETPOINT
@@ -67,10 +81,18 @@ class Backend(Protocol):
         """Return what was true, for scoring; None where nobody knows."""
         ...
 
+    remarks: list[str]
+    """What the host or the port refused, in words."""
+
     def close(self) -> None:
         """Let go of the world."""
         ...
 
+
+_SYNC_STEP_NS = 120_000
+_SYNC_PATIENCE_NS = 360_000  # two RPDOs and SYNC take 220 us; longer means that the bus does not carry it
+
+_SHARED_MEMORY = Path("/dev/shm")
 
 RIG_VENDOR_ID = 0x5254
 """Identity of the rig's drives; hardware never shows it."""
@@ -83,6 +105,7 @@ class BatchTransport:
         """Take over a batch wire."""
         self._wire, self._names, self._tick_ns = wire, names, tick_ns
         wire.cyclic.set_ids(names)
+        self.failure = ""
 
     @property
     def lost_count(self) -> int:
@@ -98,7 +121,11 @@ class BatchTransport:
         wire = self._wire
         while (line_t_ns := wire.next_line_t_ns()) <= deadline_t_ns and len(inbox.sensor_bytes) < 256:
             wire.advance_to(line_t_ns)
-            data = wire.serial.read()
+            try:
+                data = wire.serial.read()
+            except LinkError as error:
+                self.failure = str(error)
+                break
             if not data:
                 break
             inbox.sensor_bytes += data
@@ -117,6 +144,9 @@ class BatchTransport:
         sent = True
         for can_id, payload in frames:
             sent &= wire.cyclic.send(can_id, payload)
+        before_t_ns, give_up_t_ns = wire.last_sync_t_ns, wire.t_ns + _SYNC_PATIENCE_NS
+        while wire.last_sync_t_ns == before_t_ns and wire.t_ns < give_up_t_ns:
+            wire.advance_to(wire.t_ns + _SYNC_STEP_NS)
         return sent, wire.last_sync_t_ns
 
 
@@ -133,6 +163,7 @@ class BatchBackend:
         self.wire = BatchWire(self.rig)
         self.description = f"software rig {machine.name}, virtual time, seed {seed}"
         self.seed = seed
+        self.remarks: list[str] = []
         self._tick_ns = round(tick_s * 1e9)
         self.servo: Servo | None = None
 
@@ -183,3 +214,219 @@ class BatchBackend:
 
     def close(self) -> None:
         """Nothing outside this process."""
+
+
+class _Child:
+    """A process of ours that talks in JSON lines over stdin and stdout."""
+
+    def __init__(self, name: str, command: list[str]):
+        self.name = name
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1, cwd=_ROOT
+        )
+
+    def tell(self, message: dict) -> None:
+        """Send one line; LinkError where the process is gone."""
+        try:
+            self.process.stdin.write(json.dumps(message) + "\n")  # pyright: ignore[reportOptionalMemberAccess]
+            self.process.stdin.flush()  # pyright: ignore[reportOptionalMemberAccess]
+        except OSError as error:
+            raise LinkError(f"the {self.name} process is gone ({self._end()}); see its messages above") from error
+
+    def hear(self, timeout_s: float) -> dict:
+        """Return the next line; LinkError on silence, end or a reported error."""
+        stdout = self.process.stdout
+        ready, _, _ = select.select([stdout], [], [], timeout_s)
+        line = stdout.readline() if ready and stdout is not None else ""
+        if not line:
+            raise LinkError(f"the {self.name} process said nothing within {timeout_s:g} s ({self._end()})")
+        message = json.loads(line)
+        if "error" in message:
+            raise _KINDS.get(message.get("kind", ""), LinkError)(f"{self.name}: {message['error']}")
+        return message
+
+    def _end(self) -> str:
+        code = self.process.poll()
+        return "still running" if code is None else f"ended with {code}"
+
+    @property
+    def running(self) -> bool:
+        """Whether the process still lives."""
+        return self.process.poll() is None
+
+    def stop(self, timeout_s: float = 10.0) -> None:
+        """End it: terminate, then kill."""
+        for stream in (self.process.stdin, self.process.stdout):
+            if stream is not None:
+                stream.close()
+        if self.running:
+            self.process.terminate()
+        try:
+            self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+_ROOT = Path(__file__).resolve().parent.parent
+_KINDS = {kind.__name__: kind for kind in (DriveError, LinkError, ProfileError, RecordError, TimingError)}
+_WARM_TIMEOUT_S = 180.0  # a cold compile cache on a slow host
+_SERVO_START_TIMEOUT_S = 30.0
+
+
+class RealtimeBackend:
+    """Servo in a process of its own, on a real clock; what bus and port lead to is the caller's business."""
+
+    synchronous = False
+
+    def __init__(self, profile: Profile, name: str, vendor_id: int | None, interface: str, channel: str, port: str):
+        """Start warming a servo process; it opens nothing before `start_servo`."""
+        self.name, self.vendor_id = name, vendor_id
+        self.description = f"{name}: CAN {interface} {channel}, interferometer {port}"
+        self.remarks: list[str] = []
+        self._interface, self._channel, self._port = interface, channel, port
+        self._servo = _Child("servo", [sys.executable, "-m", "stagectl.servo_process"])
+        self._servo.tell(profile.effective())
+        self._warm = False
+        self._paths: dict[str, Path] = {}
+
+    def network_bus(self) -> can.BusABC:
+        """Open the master's bus."""
+        return open_network(self._interface, self._channel)
+
+    def clock_s(self) -> float:
+        """Return the clock of heartbeat ages."""
+        return time.monotonic()
+
+    @property
+    def servo_pid(self) -> int:
+        """Process id of the servo."""
+        return self._servo.process.pid
+
+    def wait_warm(self) -> None:
+        """Wait until the servo has compiled or loaded everything."""
+        if not self._warm:
+            self._servo.hear(_WARM_TIMEOUT_S)
+            self._warm = True
+
+    def start_servo(self, profile: Profile, mappings: Mapping[str, DriveMapping], run_folder: Path) -> ServoLink:
+        """Give the servo its bus, port and memory; it cycles when this returns."""
+        self.wait_warm()
+        token = f"{os.getpid()}-{secrets.token_hex(4)}"
+        paths = {name: _SHARED_MEMORY / f"stagectl-{token}.{name}" for name in ("ring", "requests", "status", "segments")}
+        self._paths = paths
+        segments = np.memmap(paths["segments"], dtype=SETPOINT, mode="w+", shape=(SEGMENT_ROWS,))
+        requests = RequestWriter(paths["requests"], REQUEST)
+        cpus = sorted(os.sched_getaffinity(0))
+        self._servo.tell(
+            {
+                "mappings": {axis: describe_mapping(mapping) for axis, mapping in mappings.items()},
+                "interface": self._interface,
+                "channel": self._channel,
+                "port": self._port,
+                "baud_bit_per_s": profile.interferometer.baud_bit_per_s,
+                "run_folder": str(run_folder.resolve()),
+                "cpu": cpus[-1] if len(cpus) > 1 else None,
+                **{name: str(path) for name, path in paths.items()},
+            }
+        )
+        answer = self._servo.hear(_SERVO_START_TIMEOUT_S)
+        self.remarks = [f"the host refused the servo {what}" for what in answer["refused"]] + answer["warnings"]
+        tracker_belief = estimator.belief(profile)
+        snapshot = {**WireDecoder(profile, mappings).snapshot(), "belief": tracker_belief}
+        return ServoLink(
+            requests=requests,
+            status=RequestReader.attach(paths["status"], STATUS),
+            rows=RingReader.attach(paths["ring"]),
+            segments=segments,
+            tracker_belief=tracker_belief,
+            snapshot=snapshot,
+            pass_time=self._pass_time,
+            now_t_ns=now_t_ns,
+            close=lambda: self._end_servo(requests),
+        )
+
+    def _pass_time(self, duration_s: float) -> None:
+        """Sleep; LinkError where the servo has died meanwhile."""
+        time.sleep(duration_s)
+        if not self._servo.running:
+            raise LinkError(
+                f"the servo process ended with {self._servo.process.returncode}; the drives stop the stage by "
+                "themselves; its last cycles are in the run"
+            )
+
+    def _end_servo(self, requests: RequestWriter) -> None:
+        """Ask the servo to exit and wait for it."""
+        requests.publish({"counter": 1 << 40, "mode": int(Mode.EXIT)})
+        try:
+            self._servo.process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            self._servo.stop()
+
+    def truth(self) -> dict[str, np.ndarray] | None:
+        """Nobody knows what is true of a machine."""
+        return None
+
+    def close(self) -> None:
+        """End the servo and remove the shared memory; rows that nobody drained stay for the next start."""
+        self._servo.stop()
+        for name, path in self._paths.items():
+            if name != "ring":
+                path.unlink(missing_ok=True)
+
+
+class HardwareBackend(RealtimeBackend):
+    """The machine that the profile describes."""
+
+    def __init__(self, profile: Profile):
+        """Take bus and port from the profile; every node must show the profile's identity."""
+        super().__init__(
+            profile, "hardware", None, profile.can.interface, profile.can.channel, profile.interferometer.port
+        )
+
+
+class RigBackend(RealtimeBackend):
+    """The software rig in a process of its own: the same bytes, in real time."""
+
+    def __init__(self, profile: Profile, machine: str | Path, *, seed: int = 0):
+        """Start the rig; servo and rig compile side by side."""
+        self._folder = Path(tempfile.mkdtemp(prefix="stagectl-rig-"))
+        channel, port = str(self._folder / "can.socket"), str(self._folder / "interferometer")
+        super().__init__(profile, "rig", RIG_VENDOR_ID, "hub", channel, port)
+        self.seed = seed
+        self._truth_path = self._folder / "truth.npz"
+        command = [sys.executable, "-m", "sim_backend", str(machine), "--socket", channel, "--pty-link", port]
+        command += ["--seed", str(seed), "--truth", str(self._truth_path), "--linger-s", "5"]
+        self._rig = _Child("rig", command)
+        self._rig.hear(_WARM_TIMEOUT_S)
+        self.description = f"software rig {Path(machine).stem}, real time, seed {seed}"
+
+    @property
+    def rig_pid(self) -> int:
+        """Process id of the rig."""
+        return self._rig.process.pid
+
+    def request(self, message: dict) -> dict:
+        """Ask the rig process something: {"fault": ...}, {"truth": path}, {"state": true}."""
+        asked = connect_hub(self._channel)
+        try:
+            asked.settimeout(5.0)
+            asked.send(b"FILT")
+            asked.send(b"RIG " + json.dumps(message).encode())
+            answer = asked.recv(1 << 16)
+        finally:
+            asked.close()
+        return json.loads(answer.removeprefix(b"RIG "))
+
+    def truth(self) -> dict[str, np.ndarray] | None:
+        """Return the rig's log so far."""
+        if self._rig.running:
+            self.request({"truth": str(self._truth_path)})
+        with np.load(self._truth_path) as stored:
+            return {name: stored[name] for name in stored.files}
+
+    def close(self) -> None:
+        """End servo and rig."""
+        super().close()
+        self._rig.stop()
+        shutil.rmtree(self._folder, ignore_errors=True)

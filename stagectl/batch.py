@@ -18,6 +18,8 @@ DEVICES = np.dtype(
         ("latch_delay_s", "f8"),  # sample instant -> SYNC that latches the command
         ("macro_resolution_m", "f8"),
         ("end_resolution_m", "f8"),
+        ("interpolation_speed_m_per_s", "f8"),  # up to it a count is divided further
+        ("interpolation_count", "f8"),  # parts of a count then
         ("macro_zero_m", "f8"),  # subtracted from what the sensor sees: the run's own zero
         ("end_zero_m", "f8"),
         ("macro_amperes_per_word", "f8"),
@@ -40,6 +42,8 @@ TRUTH = np.dtype(
     ]
 )
 """What was true at a sample."""
+
+_INTERPOLATION_COUNT = 65536.0  # parts of a count: 16 bits of phase, the uMD2's
 
 _BATCH = '''
 @compiled
@@ -67,8 +71,14 @@ def run(setpoints, noise_m, devices, state, parameters, machine_effects, measure
         m.lease_left_ns = 1000000000
         macro_m = s.macro_position_m + noise_m[k, 0]
         end_m = s.end_position_m + noise_m[k, 1]
-        m.macro_position_m = np.floor(macro_m / d.macro_resolution_m + 0.5) * d.macro_resolution_m - d.macro_zero_m
-        m.end_position_m = np.floor(end_m / d.end_resolution_m + 0.5) * d.end_resolution_m - d.end_zero_m
+        macro_step_m = d.macro_resolution_m
+        if abs(s.macro_velocity_m_per_s) <= d.interpolation_speed_m_per_s:
+            macro_step_m /= d.interpolation_count
+        end_step_m = d.end_resolution_m
+        if abs(s.end_velocity_m_per_s) <= d.interpolation_speed_m_per_s:
+            end_step_m /= d.interpolation_count
+        m.macro_position_m = np.floor(macro_m / macro_step_m + 0.5) * macro_step_m - d.macro_zero_m
+        m.end_position_m = np.floor(end_m / end_step_m + 0.5) * end_step_m - d.end_zero_m
         setpoint[0] = setpoints[k]
         tick.tick(measurement, setpoint, later, command, e, model, ahead, after, l, g, b, q, p)
         measurements[k] = measurement[0]
@@ -128,7 +138,14 @@ def simulation(controller: Controller, machine, *, latch_delay_s: float, seed: i
     devices = np.zeros(1, DEVICES)
     devices["period_s"] = float(controller.estimator["period_s"][0]) / (1.0 + machine.interferometer.clock_ppm * 1e-6)
     devices["latch_delay_s"] = latch_delay_s
-    devices["macro_resolution_m"] = devices["end_resolution_m"] = machine.interferometer.resolution_m
+    sensor = machine.interferometer
+    count_m = machine.air.wavelength_vacuum_m / sensor.counts_per_wavelength  # the index of air (3e-4) is left to the wire
+    devices["macro_resolution_m"] = devices["end_resolution_m"] = count_m
+    devices["interpolation_speed_m_per_s"] = -1.0
+    devices["interpolation_count"] = 1.0
+    if sensor.interpolation_speed_m_per_s is not None:
+        devices["interpolation_speed_m_per_s"] = sensor.interpolation_speed_m_per_s
+        devices["interpolation_count"] = _INTERPOLATION_COUNT
     devices["macro_amperes_per_word"] = 1e-3 * machine.macro.rated_current_a
     if machine.micro is not None:
         devices["micro_amperes_per_word"] = 1e-3 * machine.micro.rated_current_a

@@ -18,12 +18,12 @@ from stagectl.errors import RecordError
 from stagectl.plant import PLANT_PARAMETERS
 from stagectl.profile import Profile
 from stagectl.record import Run, read_run
-from stagectl.requests import Phase
+from stagectl.requests import TICKING, Phase
 from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT
 from stagectl.tracker import Tracker
 
 _FROM_OUTSIDE = ("lease_left_ns", "overrun_ns", "command_lost")
-_TRACKING = (int(Phase.TRACKING), int(Phase.STOPPING))
+_TICKING = tuple(int(phase) for phase in TICKING)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +119,7 @@ def _compare(rows: np.ndarray, decoder: WireDecoder, tracker: Tracker, updates: 
     for index in range(rows.size):
         row = rows[index]
         _inbox_of(row, inbox)
+        inbox.sync_t_ns = int(rows[index - 1]["sync_end_t_ns"]) if index else 0
         decoder.decode(inbox, m)
         number = int(row["update_number"])
         if number != update_before:
@@ -131,10 +132,12 @@ def _compare(rows: np.ndarray, decoder: WireDecoder, tracker: Tracker, updates: 
         phase = int(row["run_phase"])
         if phase == int(Phase.IDLE) and phase_before == int(Phase.STOPPED):
             m["emergency"][0] = 0  # acknowledged
-        if phase in _TRACKING and phase_before not in _TRACKING:
+        if phase in _TICKING and phase_before not in _TICKING:
             tracker.begin(int(row["law_number"]))
+        if phase == int(Phase.GUIDED_STOP) and phase_before != phase:
+            tracker.guide()
         wrong = [name for name in MEASUREMENT.names or () if not _same(m[name][0], row[name])]
-        if phase in _TRACKING:
+        if phase in _TICKING:
             ticks += 1
             law = int(row["law_number"])
             if law != tracker.law_number:

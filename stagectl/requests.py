@@ -18,6 +18,7 @@ class Mode(IntEnum):
     TRACK = 2  # enable, then follow segments under a law
     STOP = 3  # bring the stage to rest under the law, then take the power away
     RESET = 4  # acknowledge a fault; enables nothing
+    EXIT = 5  # end the servo; a moving stage is brought to rest first
 
 
 class Phase(IntEnum):
@@ -30,8 +31,14 @@ class Phase(IntEnum):
     TRACKING = 4
     STOPPING = 5  # under the law, towards rest
     QUICK_STOP = 6  # by the drives
-    STOPPED = 7  # a run ended by itself: `stop` says why; left by RESET
+    STOPPED = 7  # a run ended by itself: `stop` says why; left when acknowledged
+    GUIDED_STOP = 8  # the macro by its drive, the micro still under its law so that it keeps off its stops
 
+
+TICKING = (Phase.TRACKING, Phase.STOPPING, Phase.GUIDED_STOP)
+"""Phases in which the law runs every cycle."""
+
+TEXT_BYTES_COUNT = 256
 
 REQUEST = np.dtype(
     [
@@ -85,6 +92,7 @@ STATUS = np.dtype(
         ("inputs", "i8"),
         ("missed_cycles", "i8"),
         ("lost_samples", "i8"),
+        ("text", "u1", (TEXT_BYTES_COUNT,)),  # what a stop without numbers has to say, UTF-8
     ]
 )
 """Servo to supervisor, newest state only; the ring holds every cycle."""

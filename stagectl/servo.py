@@ -13,7 +13,9 @@ import numpy as np
 
 from drivers import cia402
 from drivers.wire import HEARTBEAT_FRAME, SYNC_FRAME, Inbox, WireDecoder, WireEncoder
-from stagectl.requests import REQUEST, STATUS, Mode, Phase
+from stagectl.errors import LinkError
+from stagectl.laws.reference import gap_centre
+from stagectl.requests import REQUEST, STATUS, TEXT_BYTES_COUNT, TICKING, Mode, Phase
 from stagectl.ring import RequestReader, RequestWriter, RingWriter
 from stagectl.row import FRAME_BYTES_COUNT, ROW, new_rows
 from stagectl.row_fill import fill_row, fill_status
@@ -24,8 +26,20 @@ _ENABLE_TIMEOUT_S = 2.0
 _QUICK_STOP_TIMEOUT_S = 5.0
 _HEARTBEATS_PER_TIMEOUT = 4
 _REST_M_PER_S = 1e-3
+_STATUS_ENABLED = 0x0027
 _READY_SAMPLES = 200  # before the sample clock counts as locked: 60 us / 200 = 0.3 us
 
+_GUIDED_STOPS = (
+    Stop.OPERATOR,
+    Stop.TRAVEL,
+    Stop.VELOCITY,
+    Stop.FOLLOWING_ERROR,
+    Stop.OVERRUN,
+    Stop.THERMAL,
+    Stop.LEASE,
+    Stop.SUPERVISOR_SILENT,
+)
+"""Stops after which sensor, drives and law can be trusted with the micro until the macro is slow."""
 
 _LENGTHS = tuple(count.to_bytes(8, "little") for count in range(FRAME_BYTES_COUNT + 1))
 
@@ -34,6 +48,8 @@ class Transport(Protocol):
     """Bus, serial line and clock of one world."""
 
     lost_count: int
+    failure: str
+    """What is wrong with bus or port for good, empty while both work."""
 
     def now_t_ns(self) -> int:
         """Return the time of this world's clock."""
@@ -75,6 +91,7 @@ class Servo:
         fields = ROW.fields or {}
         self._offsets = {name: fields[name][1] for name in ROW.names or ()}
         self._homing_id = 0
+        self._stated_text = ""
         self._status = np.zeros(1, STATUS)
         self._request = np.zeros(1, REQUEST)
         self._has_micro = profile.micro is not None
@@ -88,6 +105,7 @@ class Servo:
         self._stop_deceleration = 0.5 * profile.macro.stop_deceleration_m_per_s2
         self.phase = Phase.IDLE
         self.stop = Stop.NONE
+        self.text = ""
         self._phase_since_t_ns = 0
         self._segment_number = 0
         self._segment_row = 0
@@ -105,6 +123,16 @@ class Servo:
         self._deadline_t_ns = transport.now_t_ns() + self._period_ns
         self._reset_edge = False
 
+    @property
+    def mode(self) -> Mode:
+        """What the supervisor asked for last."""
+        return Mode(int(self._request["mode"][0]))
+
+    @property
+    def supervisor_silence_s(self) -> float:
+        """Time since the supervisor's counter changed."""
+        return (self.inbox.t_ns - self._counter_t_ns) * 1e-9
+
     # ---- one cycle ---------------------------------------------------------------------------------------------
 
     def cycle(self) -> None:
@@ -115,24 +143,27 @@ class Servo:
         lateness_ns = t_ns - self._deadline_t_ns
         inbox.t_ns = t_ns
         started_ns = self._clock_ns()
-        self.decoder.decode(inbox, m)
+        self._decode(t_ns)
         self._valid_samples += int(m["samples_new"][0])
         self._read_request(t_ns)
         m["command_lost"][0] = self._command_lost
         m["overrun_ns"][0] = lateness_ns if lateness_ns > self._period_ns else 0
         m["lease_left_ns"][0] = self._request["lease_until_t_ns"][0] - t_ns
         macro_target, micro_target = self._advance_phase(t_ns)
-        tracking = self.phase in (Phase.TRACKING, Phase.STOPPING)
         command = self.tracker.active.command
-        if tracking:
+        ticking = self.phase in TICKING
+        if ticking:
             self._next_setpoint(int(m["cycle"][0]))
             self.tracker.active.step()
-            if command["stop"][0] != Stop.NONE:
-                self._end(Stop(int(command["stop"][0])), Phase.QUICK_STOP, t_ns)
-                macro_target, micro_target = cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
+            stop = Stop(int(command["stop"][0]))
         else:
             command[...] = np.zeros(1, COMMAND)
             command["macro_target_m"] = m["macro_encoder_m"]
+            stop = Stop.NONE
+        if stop is not Stop.NONE:
+            macro_target = cia402.State.QUICK_STOP_ACTIVE
+            if self.phase is Phase.GUIDED_STOP or stop not in _GUIDED_STOPS:
+                micro_target = cia402.State.QUICK_STOP_ACTIVE
         macro_word = self._controlword(int(m["macro_statusword"][0]), macro_target)
         micro_word = self._controlword(int(m["micro_statusword"][0]), micro_target)
         if self.phase is Phase.HOMING_DRIVE and macro_word == cia402.ENABLE_OPERATION:
@@ -150,9 +181,38 @@ class Servo:
         tick_ns = self._clock_ns() - started_ns
         sent, sync_end_t_ns = self.transport.send(frames)
         self._command_lost = 0 if sent else 1
+        inbox.sync_t_ns = sync_end_t_ns  # what the next cycle's TPDOs were sampled at
         self._record(lateness_ns, tick_ns, sync_end_t_ns, macro_word, micro_word, macro_frame[1], micro_frame)
+        if stop is not Stop.NONE:
+            self._brake(stop, t_ns)
         self._publish()
         self._plan_next(t_ns)
+
+    def _decode(self, t_ns: int) -> None:
+        """Decode the inbox; bytes that can't be what was agreed end the run, and nothing of them is used."""
+        m = self.tracker.measurement
+        text = self.transport.failure
+        try:
+            self.decoder.decode(self.inbox, m)
+        except LinkError as error:
+            m["samples_new"][0] = 0
+            m["tpdos_new"][0] = 0
+            m["t_ns"][0] = t_ns
+            text = text or str(error)
+        if text and not self.text:
+            self.text = text
+            if self.phase in (Phase.IDLE, Phase.HOMED_DRIVE, Phase.ENABLING):
+                self._end(Stop.LINK_LOST, Phase.STOPPED, t_ns)
+            elif self.phase is not Phase.STOPPED:
+                self._end(Stop.LINK_LOST, Phase.QUICK_STOP, t_ns)
+
+    def _brake(self, stop: Stop, t_ns: int) -> None:
+        """Leave the law: the macro by its drive; the micro still guided where sensor and drives can be trusted."""
+        if self.phase is Phase.GUIDED_STOP or stop not in _GUIDED_STOPS or not self._has_micro:
+            self._end(stop, Phase.QUICK_STOP, t_ns)
+            return
+        self.tracker.guide()
+        self._end(stop, Phase.GUIDED_STOP, t_ns)
 
     def _plan_next(self, t_ns: int) -> None:
         """Set the start of the next cycle: the sensor's next sample plus the phase, else a free-running period."""
@@ -238,6 +298,8 @@ class Servo:
                 self._enter(Phase.STOPPED, t_ns)
                 return off, off
             return on, on
+        if self.phase is Phase.GUIDED_STOP:
+            return self._guided(t_ns, in_phase_s, macro_state)
         if self.phase is Phase.QUICK_STOP:
             if in_phase_s > _QUICK_STOP_TIMEOUT_S:
                 self._enter(Phase.STOPPED, t_ns)
@@ -247,11 +309,26 @@ class Servo:
         if number != self._acknowledged and mode in (Mode.RESET, Mode.IDLE):
             self._acknowledged = number
             self.stop = Stop.NONE
+            self.text = self.transport.failure
             m["emergency"][0] = 0
             self._enter(Phase.IDLE, t_ns)
         if self.stop in (Stop.OPERATOR, Stop.FINISHED):
             return off, off
         return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
+
+    def _guided(
+        self, t_ns: int, in_phase_s: float, macro_state: cia402.State
+    ) -> tuple[cia402.State, cia402.State]:
+        """Keep the micro on the braking macro until that is slow, or until the sensor falls silent."""
+        one, m = self.tracker.active, self.tracker.measurement
+        m["lease_left_ns"][0] = max(int(m["lease_left_ns"][0]), self._period_ns)  # coming to rest needs no lease
+        if macro_state is cia402.State.QUICK_STOP_ACTIVE:
+            m["macro_statusword"][0] = _STATUS_ENABLED  # it brakes as asked: no drive fault for the guard
+        slow = abs(float(one.model["macro_velocity_m_per_s"][0])) < _REST_M_PER_S
+        if slow and in_phase_s > 0.1 or in_phase_s > _QUICK_STOP_TIMEOUT_S:
+            self._enter(Phase.QUICK_STOP, t_ns)
+            return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
+        return cia402.State.QUICK_STOP_ACTIVE, cia402.State.OPERATION_ENABLED
 
     def _homing(self, mode: Mode, state: cia402.State, silent: bool, t_ns: int) -> tuple[cia402.State, cia402.State]:
         """Let the macro's drive home; the micro stays without power."""
@@ -291,6 +368,8 @@ class Servo:
         request = self._request
         if self.phase is Phase.STOPPING:
             self._slow_down(passed)
+        elif self.phase is Phase.GUIDED_STOP:
+            self._follow_macro()
         else:
             number = int(request["segment_number"][0])
             if number != self._segment_number:
@@ -314,6 +393,14 @@ class Servo:
         kept = float(hold["position_m"][0]), float(hold["relative_position_m"][0])
         hold[...] = np.zeros(1, SETPOINT)
         hold["position_m"], hold["relative_position_m"] = kept
+
+    def _follow_macro(self) -> None:
+        """Take the macro's own motion as the micro's reference while the drive brakes it."""
+        hold, model = self.tracker.hold, self.tracker.active.model
+        hold[...] = np.zeros(1, SETPOINT)
+        hold["position_m"] = model["macro_position_m"] - gap_centre(self.tracker.active.belief[0])
+        hold["velocity_m_per_s"] = model["macro_velocity_m_per_s"]
+        hold["acceleration_m_per_s2"] = model["macro_acceleration_m_per_s2"]
 
     def _slow_down(self, passed: int) -> None:
         """Bring the reference to rest at half the drive's own stopping deceleration."""
@@ -384,4 +471,8 @@ class Servo:
             self._segment_rows - self._segment_row, self._update_number, int(ready), self._missed,
             decoder.samples_lost, decoder.macro_counts, decoder.end_counts,
         )  # fmt: skip
+        if self.text != self._stated_text:
+            self._stated_text = self.text
+            encoded = self.text.encode()[:TEXT_BYTES_COUNT].ljust(TEXT_BYTES_COUNT, b"\0")
+            self._status["text"][0] = np.frombuffer(encoded, np.uint8)
         self.status.publish(self._status)

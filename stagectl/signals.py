@@ -91,6 +91,7 @@ class Stop(IntEnum):
     SUPERVISOR_SILENT = 18
     COMMAND_LOST = 19
     MEASUREMENT_NOT_FINITE = 20
+    LINK_LOST = 21
 
 
 STOP_TEXT = {
@@ -115,6 +116,7 @@ STOP_TEXT = {
     Stop.SUPERVISOR_SILENT: "the supervisor's counter stands still",
     Stop.COMMAND_LOST: "commands could not be put on the bus",
     Stop.MEASUREMENT_NOT_FINITE: "a measured position is not a finite number",
+    Stop.LINK_LOST: "the bus or the interferometer's port is gone, or speaks another layout",
 }
 
 

@@ -308,6 +308,7 @@ class Supervisor:
         if self._master is not None:
             self._master.close()
             self._master = None
+        self.backend.close()
 
     # ---- homing ----------------------------------------------------------------------------------------------
 

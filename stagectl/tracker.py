@@ -64,6 +64,10 @@ class Tracker:
         relative_m = self.measurement["end_position_m"] - self.measurement["macro_position_m"]
         self.hold["relative_position_m"] = relative_m + centre_m if belief["has_micro"][0] else 0.0
 
+    def guide(self) -> None:
+        """From here the macro's drive brakes by itself: what it reports is the force that the macro feels."""
+        self.active.estimator["position_mode"] = 1.0
+
     def switch(self, law_number: int) -> None:
         """Change the law; the new one starts from rest."""
         self.law_number = law_number

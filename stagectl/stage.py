@@ -1,0 +1,81 @@
+"""Open a stage: choose the world once, at the start, and hand out the supervisor that works in it."""
+
+import socket
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from sim_backend.machine import load_machine, machine_path_for
+from stagectl.backend import BatchBackend, HardwareBackend, RigBackend
+from stagectl.errors import LinkError, RequestError
+from stagectl.profile import Profile
+from stagectl.runs import new_run_folder
+from stagectl.supervisor import Progress, Supervisor
+
+BACKENDS = ("auto", "hardware", "rig", "batch")
+
+
+def present(profile: Profile) -> dict[str, bool]:
+    """Say which parts of the profile's hardware this host has."""
+    if profile.can.interface == "socketcan":
+        try:
+            socket.if_nametoindex(profile.can.channel)
+            has_bus = True
+        except OSError:
+            has_bus = False
+    else:
+        has_bus = Path(profile.can.channel).exists()
+    return {
+        f"CAN {profile.can.interface} {profile.can.channel}": has_bus,
+        f"interferometer {profile.interferometer.port}": Path(profile.interferometer.port).exists(),
+    }
+
+
+def choose(profile: Profile, backend: str) -> str:
+    """Resolve `auto`: the rig only where nothing of the hardware exists; half of it is a LinkError."""
+    if backend not in BACKENDS:
+        raise RequestError(f"backend {backend!r} is none of {', '.join(BACKENDS)}")
+    if backend != "auto":
+        return backend
+    parts = present(profile)
+    if not any(parts.values()):
+        return "rig"
+    if all(parts.values()):
+        return "hardware"
+    missing = ", ".join(name for name, there in parts.items() if not there)
+    found = ", ".join(name for name, there in parts.items() if there)
+    raise LinkError(
+        f"profile {profile.name}: {found} is there, {missing} is not; plug it in, or ask for --backend rig by name"
+    )
+
+
+def open_stage(
+    profile: Profile,
+    backend: str = "auto",
+    *,
+    runs_root: Path,
+    name: str,
+    seed: int = 0,
+    machine: str | Path | None = None,
+    progress: Progress = lambda what, share: None,
+    manifest: dict[str, Any] | None = None,
+) -> Supervisor:
+    """Open the world and return its supervisor; entering that configures the drives and starts the servo."""
+    chosen = choose(profile, backend)
+    truth_of = machine if machine is not None else machine_path_for(profile.name)
+    progress(f"opening {chosen}", 0.0)
+    if chosen == "hardware":
+        world = HardwareBackend(profile)
+    elif chosen == "rig":
+        world = RigBackend(profile, truth_of, seed=seed)
+    else:
+        world = BatchBackend(load_machine(truth_of), seed=seed)
+    facts = {
+        **(manifest or {}),
+        "name": name,
+        "host": socket.gethostname(),
+        "version": metadata.version("stagectl"),
+        "backend_asked": backend,
+        "seeds": [seed],
+    }
+    return Supervisor(profile, world, new_run_folder(runs_root, name), progress, facts)
