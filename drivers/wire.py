@@ -186,13 +186,16 @@ class WireDecoder:
     def _compare_with_encoder(self, m: np.ndarray, sync_t_ns: int) -> None:
         """Latch *reference lost* where laser and drive disagree for several cycles, both at the last SYNC's instant.
 
-        The drive sampled its encoder between the last two laser samples: at 0.2 m/s that is 90 um away.
+        The drive sampled its encoder between the last two laser samples: at 0.2 m/s that is 90 um away. How long the
+        host held the SYNC up is not known to better than a period, so one period's way is allowed besides: an offset
+        stays when the stage stands, and is found then.
         """
         macro_m = float(m["macro_position_m"][0])
         if self.encoder_trusted and self.sequence == self._compared_sequence + 1 and m["tpdos_new"][0] & 1:
             since_ns = int(m["sample_t_ns"][0]) - sync_t_ns
             laser_m = macro_m - (macro_m - self._compared_m) * (since_ns / self.period_ns)
-            if abs(laser_m - float(m["macro_encoder_m"][0])) <= self._disagreement_m:
+            allowed_m = self._disagreement_m + abs(macro_m - self._compared_m)
+            if abs(laser_m - float(m["macro_encoder_m"][0])) <= allowed_m:
                 self._disagreements = 0
             else:
                 self._disagreements += 1

@@ -26,6 +26,8 @@ BACKLASH = np.dtype(
         ("hold_cycles", "f8"),
         ("forgetting_ratio", "f8"),
         ("least_force_n", "f8"),
+        ("doubted_mass_kg", "f8"),  # a wrong mass or force constant shows as so much inertia, never as contact
+        ("settle_cycles", "f8"),
         ("force_share_ratio", "f8"),
         ("margin_m", "f8"),
         # exact response of one chain of three equal lags to a first-order-hold input: powers of w0 h
@@ -60,6 +62,7 @@ BACKLASH = np.dtype(
         ("contact_force_n", "f8"),  # Y, the filtered contact force
         ("side", "f8"),
         ("held", "f8"),
+        ("unsettled", "f8"),  # cycles until the filters have forgotten how they were started
         ("motor_force_n", "f8"),  # at the last sample, through the current loop
         ("left_stiffness_n_per_m", "f8"),
         ("left_m", "f8"),
@@ -83,6 +86,8 @@ BACKLASH = np.dtype(
 _POSITION_SCALE_M = 1e-4
 _VELOCITY_SCALE_M_PER_S = 1e-3
 _PRIOR_N2 = 1e4
+_DOUBT_SDS = 5.0  # of the mass, below which a force may be inertia
+_SURE_SDS = 5.0  # that a stiffness is above zero by before an edge is published
 _CORRELATION_SAMPLES = 20.0  # samples that share one independent residual, from the filter's memory of 3 tau
 
 
@@ -95,7 +100,9 @@ def init(profile, filter_s: float = 0.01, forgetting_ratio: float = 1.0) -> np.n
     b["corner_rad_per_s"] = w
     b["hold_cycles"] = np.ceil(8.0 * filter_s / h)
     b["forgetting_ratio"] = forgetting_ratio
+    b["settle_cycles"] = np.ceil(16.0 * filter_s / h)
     b["least_force_n"] = 0.3
+    b["doubted_mass_kg"] = _DOUBT_SDS * profile.micro.mass_sd_kg if profile.micro is not None else 0.0
     b["force_share_ratio"] = 0.4
     b["margin_m"] = 10e-6
     # Chain of three: X = expm(A h), input integrals by a Taylor series of the augmented matrix (first-order hold)
@@ -153,17 +160,24 @@ def _update(b, side, regressor_0, regressor_1, regressor_2, y):
 
 
 @compiled
-def _publish_edge(b, side, samples, residual_n2):
-    """Return (edge, its sd, stiffness, its sd, damping) of a side; x_b counts from the origin taken at the start."""
+def _publish_edge(b, side, residual_n2):
+    """Return (edge, its sd, stiffness, its sd) of a side in x_b; nan and inf where the force does not grow with x_b.
+
+    A force that is no contact (a cable, a wrong offset) may be held long enough to pass the gate.
+    """
     theta = b.theta
     p = b.covariance
     slope = theta[side, 0]
     intercept = theta[side, 1]
     variance = residual_n2 * _CORRELATION_SAMPLES
-    edge = -intercept / slope
-    edge_variance = variance * (p[side, 1, 1] + 2.0 * edge * p[side, 0, 1] + edge * edge * p[side, 0, 0]) / (slope * slope)
     stiffness = slope / _POSITION_SCALE_M
     stiffness_sd = np.sqrt(variance * p[side, 0, 0]) / _POSITION_SCALE_M
+    if not stiffness > _SURE_SDS * stiffness_sd:
+        return np.nan, np.inf, np.nan, np.inf
+    edge = -intercept / slope
+    edge_variance = (
+        variance * (p[side, 1, 1] + 2.0 * edge * p[side, 0, 1] + edge * edge * p[side, 0, 0]) / (slope * slope)
+    )
     return edge * _POSITION_SCALE_M + b.origin_m, np.sqrt(edge_variance) * _POSITION_SCALE_M, stiffness, stiffness_sd
 
 
@@ -183,6 +197,7 @@ def step(b, cycle, macro_position_m, end_position_m, mean_force_n, q):
         b.cycle = cycle
         b.held = 0.0
         b.side = 0.0
+        b.unsettled = b.settle_cycles
         return
     b.cycle = cycle
     b.end_1, b.end_2, b.end_3 = _filtered(b, b.end_1, b.end_2, b.end_3, b.end_in, end_position_m)
@@ -195,15 +210,25 @@ def step(b, cycle, macro_position_m, end_position_m, mean_force_n, q):
     acceleration = w * w * (b.end_1 - 2.0 * b.end_2 + b.end_3)
     joint_rate = w * (b.joint_2 - b.joint_3)
     joint_filtered = b.joint_3 + b.origin_m
-    y = q.micro_mass_kg * acceleration - b.force_3 - q.spring_n_per_m * joint_filtered - q.damping_n_s_per_m * joint_rate
+    y = (
+        q.micro_mass_kg * acceleration
+        - b.force_3
+        - q.spring_n_per_m * joint_filtered
+        - q.damping_n_s_per_m * joint_rate
+    )
     b.contact_force_n = y
-    b.greatest_force_n = max(b.greatest_force_n, abs(y))
+    if b.unsettled > 0.0:  # filters that start in motion show a step of speed: 13 N at 3 mm/s, 0.01 N after 16 tau
+        b.unsettled -= 1.0
+        return
+    least_n = b.least_force_n + b.doubted_mass_kg * abs(acceleration)
+    if abs(y) > least_n:
+        b.greatest_force_n = max(b.greatest_force_n, abs(y))
     side = 0.0
     if b.right_sd_m < b.margin_m and x_b > b.right_m + b.margin_m:
         side = 1.0
     elif b.left_sd_m < b.margin_m and x_b < -b.left_m - b.margin_m:
         side = -1.0
-    elif abs(y) > max(b.force_share_ratio * b.greatest_force_n, b.least_force_n):
+    elif abs(y) > max(b.force_share_ratio * b.greatest_force_n, least_n):
         side = 1.0 if y > 0.0 else -1.0
         if side > 0.0 and b.right_sd_m < b.margin_m or side < 0.0 and b.left_sd_m < b.margin_m:
             side = 0.0  # an edge that is known is gated by geometry alone
@@ -219,7 +244,7 @@ def step(b, cycle, macro_position_m, end_position_m, mean_force_n, q):
         b.right_samples += 1.0
         if b.right_samples > 50.0:
             b.right_residual_n2 += max(share, 1.0 / (b.right_samples - 50.0)) * (square - b.right_residual_n2)
-            edge, edge_sd, stiffness, stiffness_sd = _publish_edge(b, 1, b.right_samples, b.right_residual_n2)
+            edge, edge_sd, stiffness, stiffness_sd = _publish_edge(b, 1, b.right_residual_n2)
             b.right_m, b.right_sd_m = edge, edge_sd
             b.right_stiffness_n_per_m, b.right_stiffness_sd_n_per_m = stiffness, stiffness_sd
             b.right_damping_n_s_per_m = b.theta[1, 2] / _VELOCITY_SCALE_M_PER_S
@@ -228,7 +253,7 @@ def step(b, cycle, macro_position_m, end_position_m, mean_force_n, q):
         b.left_samples += 1.0
         if b.left_samples > 50.0:
             b.left_residual_n2 += max(share, 1.0 / (b.left_samples - 50.0)) * (square - b.left_residual_n2)
-            edge, edge_sd, stiffness, stiffness_sd = _publish_edge(b, 0, b.left_samples, b.left_residual_n2)
+            edge, edge_sd, stiffness, stiffness_sd = _publish_edge(b, 0, b.left_residual_n2)
             b.left_m, b.left_sd_m = -edge, edge_sd
             b.left_stiffness_n_per_m, b.left_stiffness_sd_n_per_m = stiffness, stiffness_sd
             b.left_damping_n_s_per_m = b.theta[0, 2] / _VELOCITY_SCALE_M_PER_S

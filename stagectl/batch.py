@@ -28,6 +28,9 @@ DEVICES = np.dtype(
         ("macro_a", "f8"),  # commands that the drives hold
         ("micro_a", "f8"),
         ("sample", "f8"),  # number of the next sample
+        ("late_sample", "f8"),  # whose line comes a cycle late; -1 = none
+        ("late_macro_m", "f8"),
+        ("late_end_m", "f8"),
     ]
 )
 """Sensor and drives behind the value seam."""
@@ -47,7 +50,7 @@ _INTERPOLATION_COUNT = 65536.0  # parts of a count: 16 bits of phase, the uMD2's
 
 _BATCH = '''
 @compiled
-def run(setpoints, noise_m, devices, state, parameters, machine_effects, measurement, setpoint, later, command,
+def run(setpoints, noise_m, late, devices, state, parameters, machine_effects, measurement, setpoint, later, command,
         e, model, ahead, after, l, g, b, q, p, measurements, commands, truth, backlashes):
     """Run a cycle a setpoint, or until a stop; returns the number of cycles done."""
     d = devices[0]
@@ -64,10 +67,7 @@ def run(setpoints, noise_m, devices, state, parameters, machine_effects, measure
         truth[k].end_position_m = s.end_position_m - d.end_zero_m
         truth[k].contact_force_n = s.contact_force_n
         m.cycle = int(d.sample)
-        m.sequence = m.cycle
         m.t_ns = int((t_s + d.latch_delay_s) * 1e9)
-        m.sample_t_ns = int(t_s * 1e9)
-        m.samples_new = 1
         m.lease_left_ns = 1000000000
         macro_m = s.macro_position_m + noise_m[k, 0]
         end_m = s.end_position_m + noise_m[k, 1]
@@ -77,8 +77,26 @@ def run(setpoints, noise_m, devices, state, parameters, machine_effects, measure
         end_step_m = d.end_resolution_m
         if abs(s.end_velocity_m_per_s) <= d.interpolation_speed_m_per_s:
             end_step_m /= d.interpolation_count
-        m.macro_position_m = np.floor(macro_m / macro_step_m + 0.5) * macro_step_m - d.macro_zero_m
-        m.end_position_m = np.floor(end_m / end_step_m + 0.5) * end_step_m - d.end_zero_m
+        macro_m = np.floor(macro_m / macro_step_m + 0.5) * macro_step_m - d.macro_zero_m
+        end_m = np.floor(end_m / end_step_m + 0.5) * end_step_m - d.end_zero_m
+        m.samples_new = 0
+        if d.late_sample >= 0.0:  # the line of the sample before is here by now
+            m.sequence = int(d.late_sample)
+            m.sample_t_ns = int(d.late_sample * d.period_s * 1e9)
+            m.samples_new += 1
+            m.macro_position_m = d.late_macro_m
+            m.end_position_m = d.late_end_m
+        d.late_sample = -1.0
+        if late[k]:
+            d.late_sample = d.sample
+            d.late_macro_m = macro_m
+            d.late_end_m = end_m
+        else:
+            m.sequence = m.cycle
+            m.sample_t_ns = int(t_s * 1e9)
+            m.samples_new += 1
+            m.macro_position_m = macro_m
+            m.end_position_m = end_m
         setpoint[0] = setpoints[k]
         tick.tick(measurement, setpoint, later, command, e, model, ahead, after, l, g, b, q, p)
         measurements[k] = measurement[0]
@@ -93,7 +111,8 @@ def run(setpoints, noise_m, devices, state, parameters, machine_effects, measure
         d.micro_a = c.micro_word * d.micro_amperes_per_word
         d.sample += 1.0
         next_s = d.sample * d.period_s
-        plant_module.advance(state, parameters, machine_effects, next_s, d.longest_substep_s, d.macro_a, d.micro_a, 1, 1)
+        plant_module.advance(state, parameters, machine_effects, next_s, d.longest_substep_s,
+                             d.macro_a, d.micro_a, 1, 1)
         truth[k].end_mean_m = (s.end_position_integral_m_s - area) / (s.t_s - before_s) - d.end_zero_m
         if c.stop != 0:
             return k + 1
@@ -139,7 +158,8 @@ def simulation(controller: Controller, machine, *, latch_delay_s: float, seed: i
     devices["period_s"] = float(controller.estimator["period_s"][0]) / (1.0 + machine.interferometer.clock_ppm * 1e-6)
     devices["latch_delay_s"] = latch_delay_s
     sensor = machine.interferometer
-    count_m = machine.air.wavelength_vacuum_m / sensor.counts_per_wavelength  # the index of air (3e-4) is left to the wire
+    # A count in vacuum: what the index of air takes from it (3e-4) matters to bytes, not to a resolution.
+    count_m = machine.air.wavelength_vacuum_m / sensor.counts_per_wavelength
     devices["macro_resolution_m"] = devices["end_resolution_m"] = count_m
     devices["interpolation_speed_m_per_s"] = -1.0
     devices["interpolation_count"] = 1.0
@@ -150,6 +170,7 @@ def simulation(controller: Controller, machine, *, latch_delay_s: float, seed: i
     if machine.micro is not None:
         devices["micro_amperes_per_word"] = 1e-3 * machine.micro.rated_current_a
     devices["longest_substep_s"] = 50e-6
+    devices["late_sample"] = -1.0
     return Simulation(
         module=compose.generated_module("batch", source),
         controller=controller,
@@ -162,9 +183,14 @@ def simulation(controller: Controller, machine, *, latch_delay_s: float, seed: i
     )
 
 
-def run(simulation: Simulation, setpoints: np.ndarray) -> Recording:
-    """Run a cycle a setpoint (SETPOINT array) or until a stop, and return what was recorded."""
+def run(simulation: Simulation, setpoints: np.ndarray, late: np.ndarray | None = None) -> Recording:
+    """Run a cycle a setpoint (SETPOINT array) or until a stop, and return what was recorded.
+
+    `late` (bool, one a cycle): where the sample's line comes after its cycle began, so that the next cycle has it.
+    """
     count = setpoints.size
+    if late is None:
+        late = np.zeros(count, np.bool_)
     noise_m = simulation.noise.standard_normal((count, 2)) * simulation.noise_m
     measurements = np.zeros(count, MEASUREMENT)
     commands = np.zeros(count, COMMAND)
@@ -172,7 +198,7 @@ def run(simulation: Simulation, setpoints: np.ndarray) -> Recording:
     estimates = np.zeros((count, 4))
     c = simulation.controller
     done = simulation.module.run(
-        setpoints, noise_m, simulation.devices, simulation.state, simulation.parameters, simulation.effects,
+        setpoints, noise_m, late, simulation.devices, simulation.state, simulation.parameters, simulation.effects,
         c.measurement, c.setpoint, c.later, c.command, c.estimator, c.model, c.ahead, c.after, c.law, c.guard,
         c.backlash, c.belief, c.effects, measurements, commands, truth, estimates,
     )  # fmt: skip

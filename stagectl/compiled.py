@@ -42,3 +42,8 @@ numba.config.CACHE_DIR = str(CACHE_FOLDER / "numba")  # pyright: ignore[reportAt
 def compiled(function):
     """Compile `function` on first call. No fastmath (bits change); division by zero gives inf or nan, as in numpy."""
     return numba.njit(cache=True, error_model="numpy", nogil=True)(function)
+
+
+def inlined(function):
+    """Compile as `compiled` does, and melt into every compiled caller: for small functions of the innermost loop."""
+    return numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)(function)

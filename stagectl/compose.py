@@ -22,13 +22,13 @@ from stagectl.errors import ProfileError
 
 _FORCES_HEAD = '''"""Generated: the effects of one machine, called in a row."""
 from stagectl import plant
-from stagectl.compiled import compiled
+from stagectl.compiled import inlined
 from stagectl.effects import CATALOGUE
 '''
 
 _SUBSTEP = '''
 
-@compiled
+@inlined
 def substep(state, parameters, effect_parameters, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_bridge):
     s = state[0]
     q = parameters[0]
@@ -59,8 +59,9 @@ def advance(state, parameters, effect_parameters, until_s, longest_s, macro_a, m
     if not span > 0.0:
         return
     count = int(np.ceil(span / longest_s - 1e-9))
+    dt_s = span / count
     for _ in range(count):
-        substep(state, parameters, effect_parameters, span / count, macro_a, micro_a, macro_bridge, micro_bridge)
+        substep(state, parameters, effect_parameters, dt_s, macro_a, micro_a, macro_bridge, micro_bridge)
     state[0].t_s = until_s
 '''
 
@@ -101,7 +102,7 @@ def _forces_source(structure: tuple[tuple[str, str], ...]) -> str:
         calls[place].append(f"    total += effect_{k}({', '.join([*known.quantities, *slots])})")
     for place in PLACES:
         quantities = CONTACT_QUANTITIES if place == "contact" else QUANTITIES
-        lines += ["", "", "@compiled", f"def {place}({', '.join(quantities)}, p):", "    total = 0.0"]
+        lines += ["", "", "@inlined", f"def {place}({', '.join(quantities)}, p):", "    total = 0.0"]
         lines += [*calls[place], "    return total"]
     return "\n".join(lines) + "\n"
 
@@ -142,7 +143,7 @@ def plant_module(effects: Iterable[Mapping[str, Any]]) -> ModuleType:
     forces = forces_module(structure_of(effects))
     source = (
         '"""Generated: the plant of one machine."""\nimport numpy as np\n\nfrom stagectl import plant\n'
-        "from stagectl.compiled import compiled\n"
+        "from stagectl.compiled import compiled, inlined\n"
         f"from {forces.__name__} import contact, macro_actuator, macro_force, micro_actuator, micro_force\n" + _SUBSTEP
     )
     return generated_module("plant", source)

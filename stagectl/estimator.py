@@ -17,7 +17,7 @@ ESTIMATOR = np.dtype(
         ("period_s", "f8"),
         ("actuation_delay_s", "f8"),  # sample instant -> the SYNC that latches the command
         ("longest_substep_s", "f8"),
-        ("predicted_samples_max", "f8"),
+        ("bridged_samples_max", "f8"),  # missing in a row that the identification's filters are carried over
         ("macro_amperes_per_word", "f8"),
         ("micro_amperes_per_word", "f8"),
         ("macro_position_gain_ratio", "f8"),
@@ -40,6 +40,8 @@ ESTIMATOR = np.dtype(
         ("end_innovation_m", "f8"),
     ]
 )
+
+_BRIDGED_SAMPLES = 10.0  # prediction over 10 ms is still within a few nm of the motion
 
 FREE_SUPPLY_V = 1e12  # a belief's current loop never runs out of voltage
 
@@ -106,7 +108,7 @@ def init(profile) -> np.ndarray:
     e["period_s"] = period_s
     e["actuation_delay_s"] = profile.cycle.actuation_delay_s
     e["longest_substep_s"] = 300e-6
-    e["predicted_samples_max"] = profile.cycle.predicted_samples_count
+    e["bridged_samples_max"] = _BRIDGED_SAMPLES
     e["position_mode"] = float(profile.macro.mode == "position")
     noise_m = profile.interferometer.noise_m
     control = profile.control

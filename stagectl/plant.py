@@ -14,12 +14,13 @@ one evaluation of the forces a substep. The calls of the effects stand in a gene
 
 import numpy as np
 
-from stagectl.compiled import compiled
+from stagectl.compiled import compiled, inlined
 
 BRIDGE_OFF = 0
 BRIDGE_CURRENT = 1
 BRIDGE_SHORTED = 2
 
+_SAME_DT_RATIO = 1e-8  # spans of equal length differ by what rounding of their ends leaves
 _NOISE_SLOT_S = 1e-3  # force noise is held for a millisecond, whatever the substeps, so that both seams feel the same
 
 PLANT_STATE = np.dtype(
@@ -38,12 +39,20 @@ PLANT_STATE = np.dtype(
         ("contact_force_n", "f8"),  # F_b of (5) with contact effects: retards the macro, drives the end
         ("macro_position_integral_m_s", "f8"),
         ("end_position_integral_m_s", "f8"),
-        ("noise_slot", "f8"),
+        ("noise_from_s", "f8"),  # slot of time that the force noise below is held for
+        ("noise_until_s", "f8"),
         ("macro_disturbance_n", "f8"),  # a machine's force noise, or what an observer takes for it
         ("micro_disturbance_n", "f8"),
-        ("decay_dt_s", "f8"),  # the substep that the two decays below belong to
+        ("decay_dt_s", "f8"),  # the substep that the decays below belong to
         ("macro_decay_ratio", "f8"),
         ("micro_decay_ratio", "f8"),
+        ("macro_mean_ratio", "f8"),  # mean of the decay over the substep
+        ("micro_mean_ratio", "f8"),
+        ("other_decay_dt_s", "f8"),  # the same of the other substep: a cycle has one before and one behind SYNC
+        ("other_macro_decay_ratio", "f8"),
+        ("other_micro_decay_ratio", "f8"),
+        ("other_macro_mean_ratio", "f8"),
+        ("other_micro_mean_ratio", "f8"),
         ("middle_macro_position_m", "f8"),  # of the substep under way
         ("middle_macro_velocity_m_per_s", "f8"),
         ("middle_end_position_m", "f8"),
@@ -145,7 +154,6 @@ def init(machine) -> np.ndarray:
     s["end_position_m"] = machine.start.macro_position_m
     if machine.micro is not None:
         s["end_position_m"] += machine.start.relative_position_m
-    s["noise_slot"] = -1.0
     return s
 
 
@@ -171,16 +179,34 @@ def _gaussian(counter):
 @compiled
 def _draw_noise(s, q):
     """Renew the held force noise when a new slot of time begins; depends on time and seed only."""
-    slot = np.floor((s.t_s + 1e-9) / _NOISE_SLOT_S)
-    if slot != s.noise_slot:
-        s.noise_slot = slot
+    t_s = s.t_s + 1e-9
+    if t_s < s.noise_from_s or t_s >= s.noise_until_s:
+        slot = np.floor(t_s / _NOISE_SLOT_S)
+        s.noise_from_s = slot * _NOISE_SLOT_S
+        s.noise_until_s = (slot + 1.0) * _NOISE_SLOT_S
         counter = np.uint64(slot) * np.uint64(2) + np.uint64(q.seed) * np.uint64(0x100000000)
         s.macro_disturbance_n = q.macro_noise_n * _gaussian(counter)
         s.micro_disturbance_n = q.micro_noise_n * _gaussian(counter + np.uint64(1))
 
 
 @compiled
-def _current_step(i, command, bridge, v, dt_s, loop_decay, limit, loop_s, r, ind, ke, supply):
+def _take_decays(s, q, dt_s):
+    """Bring the current loops' decays for this substep to the front; two are kept, exponentials are dear."""
+    s.decay_dt_s, s.other_decay_dt_s = s.other_decay_dt_s, s.decay_dt_s
+    s.macro_decay_ratio, s.other_macro_decay_ratio = s.other_macro_decay_ratio, s.macro_decay_ratio
+    s.micro_decay_ratio, s.other_micro_decay_ratio = s.other_micro_decay_ratio, s.micro_decay_ratio
+    s.macro_mean_ratio, s.other_macro_mean_ratio = s.other_macro_mean_ratio, s.macro_mean_ratio
+    s.micro_mean_ratio, s.other_micro_mean_ratio = s.other_micro_mean_ratio, s.micro_mean_ratio
+    if not abs(dt_s - s.decay_dt_s) <= _SAME_DT_RATIO * dt_s:
+        s.decay_dt_s = dt_s
+        s.macro_decay_ratio = np.exp(-dt_s / q.macro_current_loop_s)
+        s.micro_decay_ratio = np.exp(-dt_s / q.micro_current_loop_s)
+        s.macro_mean_ratio = (1.0 - s.macro_decay_ratio) * q.macro_current_loop_s / dt_s
+        s.micro_mean_ratio = (1.0 - s.micro_decay_ratio) * q.micro_current_loop_s / dt_s
+
+
+@inlined
+def _current_step(i, command, bridge, v, dt_s, loop_decay, loop_mean, limit, loop_s, r, ind, ke, supply):
     """Return (current after, mean current over) `dt_s`: L di/dt = u - R i - Ke v, (3).
 
     An ideal PI loop holds u such that the current follows its command with time constant `loop_s`
@@ -188,31 +214,27 @@ def _current_step(i, command, bridge, v, dt_s, loop_decay, limit, loop_s, r, ind
     """
     if bridge == BRIDGE_CURRENT:
         goal = min(max(command, -limit), limit)
-        u = ind * (goal - i) / loop_s + r * i + ke * v
-        if u > supply or u < -supply:
-            u = supply if u > supply else -supply
+        u_s = ind * (goal - i) + (r * i + ke * v) * loop_s  # voltage times `loop_s`: no division
+        if u_s > supply * loop_s or u_s < -supply * loop_s:
+            u = supply if u_s > 0.0 else -supply
             slope = (u - r * i - ke * v) / ind
             return i + slope * dt_s, i + 0.5 * slope * dt_s
-        tau = loop_s
-        decay = loop_decay
-    elif bridge == BRIDGE_SHORTED:
+        return goal + (i - goal) * loop_decay, goal + (i - goal) * loop_mean
+    if bridge == BRIDGE_SHORTED:
         goal = -ke * v / r
         tau = ind / r
         decay = np.exp(-dt_s / tau)
-    else:
-        return 0.0, 0.0
-    return goal + (i - goal) * decay, goal + (i - goal) * (1.0 - decay) * tau / dt_s
+        return goal + (i - goal) * decay, goal + (i - goal) * (1.0 - decay) * tau / dt_s
+    return 0.0, 0.0
 
 
-@compiled
+@inlined
 def half_step(s, q, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_bridge):
     """Drift to the middle of the substep and take motor forces and contact geometry there."""
     if q.draws_noise != 0.0:
         _draw_noise(s, q)
-    if dt_s != s.decay_dt_s:
-        s.decay_dt_s = dt_s
-        s.macro_decay_ratio = np.exp(-dt_s / q.macro_current_loop_s)
-        s.micro_decay_ratio = np.exp(-dt_s / q.micro_current_loop_s)
+    if not abs(dt_s - s.decay_dt_s) <= _SAME_DT_RATIO * dt_s:
+        _take_decays(s, q, dt_s)
     half = 0.5 * dt_s
     s.middle_macro_position_m = s.macro_position_m + half * s.macro_velocity_m_per_s
     s.middle_macro_velocity_m_per_s = s.macro_velocity_m_per_s + half * s.macro_acceleration_m_per_s2
@@ -223,6 +245,7 @@ def half_step(s, q, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_
         s.macro_velocity_m_per_s,
         dt_s,
         s.macro_decay_ratio,
+        s.macro_mean_ratio,
         q.macro_current_limit_a,
         q.macro_current_loop_s,
         q.macro_resistance_ohm,
@@ -243,6 +266,7 @@ def half_step(s, q, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_
         s.end_velocity_m_per_s - s.macro_velocity_m_per_s,
         dt_s,
         s.micro_decay_ratio,
+        s.micro_mean_ratio,
         q.micro_current_limit_a,
         q.micro_current_loop_s,
         q.micro_resistance_ohm,
@@ -268,7 +292,7 @@ def half_step(s, q, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_
         s.penetration_velocity_m_per_s = 0.0
 
 
-@compiled
+@inlined
 def _stop_force(x, v, low, high, stiffness, damping):
     """Push of a hard stop on a body at x: zero between `low` and `high`, never pulling."""
     if x > high:
@@ -278,9 +302,9 @@ def _stop_force(x, v, low, high, stiffness, damping):
     return 0.0
 
 
-@compiled
+@inlined
 def joint_force(s, q, contact_effects_n):
-    """Return the force of spring, damping, contact and stroke stops on the end at the middle motion (opposite on the macro)."""
+    """Return the force of spring, damping, contact and stroke stops on the end, at the middle; opposite on the macro."""
     relative_m = s.middle_end_position_m - s.middle_macro_position_m
     relative_m_per_s = s.middle_end_velocity_m_per_s - s.middle_macro_velocity_m_per_s
     force_n = -q.spring_n_per_m * relative_m - q.damping_n_s_per_m * relative_m_per_s
@@ -299,7 +323,7 @@ def joint_force(s, q, contact_effects_n):
     return force_n + s.contact_force_n
 
 
-@compiled
+@inlined
 def base_force(s, q):
     """Return the force of the base on the macro at the middle motion: K1 and the travel's stops."""
     stop_n = _stop_force(
@@ -313,7 +337,7 @@ def base_force(s, q):
     return stop_n - q.base_spring_n_per_m * s.middle_macro_position_m
 
 
-@compiled
+@inlined
 def full_step(s, q, dt_s, macro_effects_n, micro_effects_n, contact_effects_n):
     """Kick with all forces of the middle, then drift to the end of the substep."""
     macro_n = s.macro_force_n + s.macro_disturbance_n + macro_effects_n + base_force(s, q)

@@ -120,7 +120,7 @@ class Servo:
         self._missed = 0
         self._command_lost = 0
         self._last_cycle = -1
-        self._deadline_t_ns = transport.now_t_ns() + self._period_ns
+        self._deadline_t_ns = 0
         self._reset_edge = False
 
     @property
@@ -139,6 +139,8 @@ class Servo:
         """Run one cycle, from waiting for its start to its row in the ring."""
         inbox, m = self.inbox, self.tracker.measurement
         inbox.clear()
+        if self._rows == 0:  # what passed since the servo was made is nobody's lateness
+            self._deadline_t_ns = self.transport.now_t_ns() + self._period_ns
         t_ns = self.transport.receive(self._deadline_t_ns, inbox)
         lateness_ns = t_ns - self._deadline_t_ns
         inbox.t_ns = t_ns

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers import sample_clock
 from drivers.can_bus import open_cyclic
 from drivers.serial_port import SerialPort
 from drivers.transport import RealtimeTransport, now_t_ns
@@ -110,6 +111,14 @@ def _warm(profile: Profile) -> None:
         status, one.measurement, tracker.setpoint, tracker.hold, one.backlash,
         0, 0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0,
     )  # fmt: skip
+    tracker.begin(0)
+    tracker.guide()
+    tracker.update(tracker.new_belief(), 0.0, 0.0)
+    clock = sample_clock.init(1e6, 0.0)
+    for sequence in range(3):
+        sample_clock.step(clock, sequence, sequence * 1_000_000)
+    sample_clock.sample_t_ns(clock, 3)
+    sample_clock.sample_age_ns(clock, 3, 3_000_000)
     RingWriter(None, slots_count=2)
 
 
@@ -135,15 +144,15 @@ def _serve(profile: Profile, config: dict[str, Any]) -> int:
     """Open bus, port and memory, and run the loop."""
     mappings = {axis: mapping_of(table) for axis, table in config["mappings"].items()}
     segments = np.memmap(config["segments"], dtype=SETPOINT, mode="r")
+    _rehearse(profile, mappings, segments)  # before the port is open: its buffer would fill with old lines
     names = frame_names(mappings)
     bus = open_cyclic(config["interface"], config["channel"], list(names))
     port = SerialPort(config["port"], config["baud_bit_per_s"])
-    transport = RealtimeTransport(bus, port, names)
     ring_path = Path(config["ring"])
     ring = RingWriter(ring_path, run_folder=config["run_folder"])
     requests = RequestReader.attach(Path(config["requests"]), REQUEST)
     status = RequestWriter(Path(config["status"]), STATUS)
-    _rehearse(profile, mappings, segments)
+    transport = RealtimeTransport(bus, port, names)
     servo = Servo(
         profile,
         WireDecoder(profile, mappings),
@@ -157,6 +166,8 @@ def _serve(profile: Profile, config: dict[str, Any]) -> int:
     )
     refused = make_real_time(config.get("cpu"))
     _say({"running": True, "refused": refused, "warnings": port.warnings})
+    while port.read():  # lines that waited are old: their arrival says nothing
+        pass
     orphaned = _run(servo)
     transport.close()
     ring.close()

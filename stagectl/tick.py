@@ -35,8 +35,10 @@ def estimate(m, e, model, ahead, b, q, p):
         if x.position_mode != 0.0:  # the drive's loop decides: what it reports is what the macro felt
             x.macro_word = m.macro_reported_force_n / (x.macro_amperes_per_word * q[0].macro_force_constant_n_per_a)
             x.macro_word_before = x.macro_word
-        periods = min(m.cycle - x.cycle, 50.0)
-        for _ in range(periods):
+        periods = int(min(m.cycle - x.cycle, 50.0))
+        fresh = m.samples_new > 0 and m.sequence == m.cycle
+        x.predicted_samples = 0.0 if fresh else x.predicted_samples + periods
+        for k in range(periods):
             t_s = s.t_s
             plant_module.advance(model, q, p, t_s + x.actuation_delay_s, x.longest_substep_s,
                                  x.macro_word_before * x.macro_amperes_per_word,
@@ -44,30 +46,25 @@ def estimate(m, e, model, ahead, b, q, p):
             plant_module.advance(model, q, p, t_s + x.period_s, x.longest_substep_s,
                                  x.macro_word * x.macro_amperes_per_word,
                                  x.micro_word * x.micro_amperes_per_word, 1, 1)
-            mean_n = backlash.motor_mean_force(b[0], q[0], x.micro_word_before, x.micro_word,
-                                               x.micro_amperes_per_word, x.actuation_delay_s)
+            last = k == periods - 1
+            if last and fresh:
+                estimator.correct(x, s, q[0], m)
+            x.macro_seen_m = m.macro_position_m if last and fresh else s.macro_position_m
+            x.end_seen_m = m.end_position_m if last and fresh else s.end_position_m
+            if q[0].has_micro != 0.0 and periods + x.predicted_samples <= x.bridged_samples_max:
+                # A line that comes late is one in twenty: its place is filled by what was predicted (a few nm off).
+                mean_n = backlash.motor_mean_force(b[0], q[0], x.micro_word_before, x.micro_word,
+                                                   x.micro_amperes_per_word, x.actuation_delay_s)
+                relative_m = x.end_seen_m - x.macro_seen_m
+                rate = s.end_velocity_m_per_s - s.macro_velocity_m_per_s
+                mean_n += forces.micro_actuator(x.end_seen_m, s.end_velocity_m_per_s, relative_m, rate,
+                                                s.micro_current_a, mean_n, mean_n, s.t_s, p)
+                mean_n += forces.micro_force(x.end_seen_m, s.end_velocity_m_per_s, relative_m, rate,
+                                             s.micro_current_a, mean_n, mean_n, s.t_s, p)
+                backlash.step(b[0], x.cycle + k + 1, x.macro_seen_m, x.end_seen_m, mean_n, q[0])
             x.macro_word_before = x.macro_word
             x.micro_word_before = x.micro_word
         x.cycle = m.cycle
-        fresh = m.samples_new > 0 and m.sequence == m.cycle
-        if fresh:
-            estimator.correct(x, s, q[0], m)
-            x.predicted_samples = 0.0
-        else:
-            x.predicted_samples += 1.0
-        macro_m = m.macro_position_m if fresh else s.macro_position_m
-        end_m = m.end_position_m if fresh else s.end_position_m
-        if q[0].has_micro != 0.0 and x.predicted_samples <= x.predicted_samples_max:
-            # A line that comes late is one in twenty: its place is filled by what was predicted (a few nm off).
-            relative_m = end_m - macro_m
-            rate = s.end_velocity_m_per_s - s.macro_velocity_m_per_s
-            mean_n += forces.micro_actuator(end_m, s.end_velocity_m_per_s, relative_m, rate,
-                                            s.micro_current_a, mean_n, mean_n, s.t_s, p)
-            mean_n += forces.micro_force(end_m, s.end_velocity_m_per_s, relative_m, rate,
-                                         s.micro_current_a, mean_n, mean_n, s.t_s, p)
-            backlash.step(b[0], m.cycle, macro_m, end_m, mean_n, q[0])
-        x.macro_seen_m = macro_m
-        x.end_seen_m = end_m
     ahead[0] = model[0]
     plant_module.advance(ahead, q, p, s.t_s + x.actuation_delay_s, x.longest_substep_s,
                          x.macro_word * x.macro_amperes_per_word, x.micro_word * x.micro_amperes_per_word, 1, 1)

@@ -1,0 +1,1 @@
+"""What the commands do, behind their arguments; imported when a command runs, so that `--help` is quick."""

@@ -1,0 +1,128 @@
+"""How a command speaks: one answer on stdout, progress and errors on stderr, an exit code that means something."""
+
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn
+
+import typer
+from rich.console import Console, RenderableType
+
+from stagectl.commands.interruption import Interruption
+from stagectl.commands.live_progress import LiveProgress
+from stagectl.errors import DriveError, LinkError, ProfileError, RecordError, RequestError, StagectlError, TimingError
+
+EXIT_CODES: dict[type[StagectlError], int] = {
+    ProfileError: 2,
+    RequestError: 2,
+    LinkError: 3,
+    DriveError: 3,
+    TimingError: 4,
+    RecordError: 5,
+}
+ENDED_EARLY = 1
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a command found: one JSON object, the same for people, and the exit code."""
+
+    data: dict[str, Any]
+    shown: Sequence[RenderableType] = ()
+    exit_code: int = 0
+
+
+@dataclass(slots=True)
+class Voice:
+    """What a command says while it works; `run_folder` is named when it is interrupted or fails."""
+
+    console: Console
+    progress: LiveProgress
+    hush: Callable[[], None]  # from here on no signal interrupts
+    run_folder: Path | None = field(default=None)
+
+    def note(self, text: str) -> None:
+        """Say a sentence on stderr."""
+        self.console.print(text, style="dim", highlight=False, markup=False, soft_wrap=True)
+
+    def warn(self, text: str) -> None:
+        """Say a sentence that nobody should miss."""
+        self.console.print(text, style="yellow", highlight=False, markup=False, soft_wrap=True)
+
+
+def jsonable(value: Any) -> Any:
+    """Turn numpy values and paths into JSON's; what is no finite number becomes null."""
+    if isinstance(value, dict):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(item) for item in value]
+    if isinstance(value, bool | str | int) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "tolist"):
+        return jsonable(value.tolist())
+    return str(value)
+
+
+def deliver(command: str, as_json: bool, work: Callable[[Voice], Answer]) -> NoReturn:
+    """Do the work and end the command: prints the answer or the error, raises typer.Exit with the exit code."""
+    console = Console(stderr=True)
+    interruption = Interruption()
+    voice = Voice(console, LiveProgress(console, interruption.check), interruption.hush)
+    try:
+        with interruption, voice.progress:
+            answer = work(voice)
+    except StagectlError as error:
+        code = EXIT_CODES.get(type(error), ENDED_EARLY)
+        _say_error(command, as_json, console, voice, error, code)
+        raise typer.Exit(code) from error
+    except KeyboardInterrupt as interrupt:
+        _say_interrupted(command, as_json, console, voice)
+        raise typer.Exit(INTERRUPTED) from interrupt
+    if as_json:
+        _print_json({"command": command, "exit_code": answer.exit_code, **answer.data})
+    else:
+        out = Console()
+        for part in answer.shown:
+            out.print(part, highlight=False, soft_wrap=isinstance(part, str))
+    raise typer.Exit(answer.exit_code)
+
+
+def _print_json(value: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(jsonable(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    sys.stdout.flush()
+
+
+def _say_error(
+    command: str, as_json: bool, console: Console, voice: Voice, error: StagectlError, exit_code: int
+) -> None:
+    kind = type(error).__name__
+    console.print(f"[bold red]{kind}[/]", highlight=False)
+    console.print(str(error), highlight=False, markup=False, soft_wrap=True)
+    run = _existing_run(voice)
+    if run is not None:
+        voice.note(f"the run up to here: {run}")
+    if as_json:
+        failure = {"kind": kind, "message": str(error)}
+        _print_json({"command": command, "exit_code": exit_code, "error": failure, "run": run})
+
+
+def _say_interrupted(command: str, as_json: bool, console: Console, voice: Voice) -> None:
+    run = _existing_run(voice)
+    moved = "the stage was brought to rest and the run closed" if run is not None else "nothing was recorded"
+    console.print(f"[bold yellow]interrupted[/]: {moved}", highlight=False)
+    if run is not None:
+        voice.note(f"the run up to here: {run}")
+    if as_json:
+        failure = {"kind": "Interrupted", "message": moved}
+        _print_json({"command": command, "exit_code": INTERRUPTED, "error": failure, "run": run})
+
+
+def _existing_run(voice: Voice) -> Path | None:
+    folder = voice.run_folder
+    return folder if folder is not None and folder.exists() else None

@@ -1,0 +1,99 @@
+"""Open a stage for a command: progress and interrupts reach it, and whatever happens it comes to rest and is closed."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from stagectl.commands.answer import Voice
+from stagectl.errors import RequestError
+from stagectl.profile import Profile, load_profile
+from stagectl.run_scores import VALUE_SEAM, write_truth
+from stagectl.signals import STOP_TEXT, Stop
+from stagectl.stage import BACKENDS, open_stage
+from stagectl.suggestion import closest
+from stagectl.supervisor import Outcome, Supervisor
+from stagectl.tracker import LAW_NAMES
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where and with what a command works, as its options say."""
+
+    profile: Profile
+    backend: str
+    runs_root: Path
+    seed: int
+
+    @property
+    def is_value_seam(self) -> bool:
+        """Whether the machine stands straight behind the law."""
+        return self.backend == VALUE_SEAM
+
+
+def place(profile: str, backend: str, runs_root: Path, seed: int) -> Place:
+    """Check the options that every moving command has. Errors: ProfileError, RequestError."""
+    known = (*BACKENDS, VALUE_SEAM)
+    if backend not in known:
+        raise RequestError(f"--backend {backend!r}: there is no such backend{closest(backend, known)}")
+    return Place(load_profile(profile), backend, runs_root, seed)
+
+
+def law_name(asked: str | None, profile: Profile) -> str:
+    """Return the law asked for, the profile's where none was. Errors: RequestError."""
+    law = profile.control.law if asked is None else asked
+    if law not in LAW_NAMES:
+        raise RequestError(f"--law {law!r}: there is no such law; one of {', '.join(LAW_NAMES)} is needed")
+    return law
+
+
+@contextmanager
+def opened(where: Place, name: str, voice: Voice) -> Iterator[Supervisor]:
+    """Yield a connected supervisor; leaving brings the stage to rest, keeps the truth where known, closes the run."""
+    stage = open_stage(
+        where.profile,
+        where.backend,
+        runs_root=where.runs_root,
+        name=name,
+        seed=where.seed,
+        progress=voice.progress,
+    )
+    try:
+        voice.note(f"{where.profile.name} on {stage.backend.description}")
+        if where.backend == "auto" and stage.backend.name != "hardware":
+            voice.note("auto: neither the profile's CAN interface nor its serial port is here, so the rig plays it")
+        voice.run_folder = stage.folder
+        stage.connect()
+        yield stage
+    finally:
+        voice.hush()
+        try:
+            _rest(stage)
+        finally:
+            stage.close()
+
+
+def _rest(stage: Supervisor) -> None:
+    """Bring the stage to rest and keep what was true, while there is somebody who knows."""
+    if not stage.is_connected:
+        return
+    stage.disarm()
+    truth = stage.backend.truth()
+    if truth is not None:
+        from sim_backend.machine import load_machine  # scoring, and only that, may read what the rig is
+
+        write_truth(stage.folder, truth, load_machine(stage.profile.name).backlash)
+
+
+def home_and_arm(stage: Supervisor, law: str | None = None) -> Outcome:
+    """Home, then hold under a law; an Outcome that is not finished says why not."""
+    homed = stage.home()
+    if not homed.finished:
+        return homed
+    stop = stage.enable(law)
+    return homed if stop is Stop.NONE else Outcome("enable", stop, homed.first_row, homed.rows)
+
+
+def ended(outcome: Outcome) -> str:
+    """Say how a motion ended."""
+    return f"{outcome.name}: {STOP_TEXT[outcome.stop]}"

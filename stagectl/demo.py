@@ -1,0 +1,142 @@
+"""The demo: home, identify the backlash, follow one trajectory under one law after the other.
+
+Drives a supervisor object and returns what happened; prints nothing and writes nothing. What it achieved is scored
+from the run (`stagectl.run_scores`) and shown by `stagectl.run_page`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from stagectl import trajectory as trajectories
+from stagectl.errors import RequestError
+from stagectl.profile import Profile
+from stagectl.requests import Phase
+from stagectl.signals import STOP_TEXT, Stop
+from stagectl.supervisor import Outcome, Supervisor
+
+LAWS = ("pid", "dsmc")
+"""The rival first: figures draw ours on top."""
+
+DWELL_S = 1.0
+LONGEST_STROKE_M = 0.8
+SPEED_M_PER_S = 0.2
+_TRAVEL_SHARE = 8.0 / 9.0
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Trip:
+    """A motion that did not come to its own end, and was repeated."""
+
+    motion: str
+    stop: Stop
+
+    @property
+    def text(self) -> str:
+        """The sentence for the operator."""
+        return f"{self.motion}: {STOP_TEXT[self.stop]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Driven:
+    """What the stage did: every motion's last outcome in order, and what had to be repeated."""
+
+    outcomes: tuple[Outcome, ...]
+    trips: tuple[Trip, ...]
+
+    @property
+    def stop(self) -> Stop:
+        """FINISHED where every motion came to its own end, else why the last one did not."""
+        return self.outcomes[-1].stop
+
+
+def planned(profile: Profile, dwell_s: float = DWELL_S) -> trajectories.Trajectory:
+    """Plan the demo's trapezoid: 0.8 m at 0.2 m/s, or what the travel and the speed limit of a profile allow."""
+    low_m, high_m = profile.macro.travel_m
+    stroke_m = min(LONGEST_STROKE_M, _TRAVEL_SHARE * (high_m - low_m))
+    return trajectories.trapezoid(
+        stroke_m,
+        min(SPEED_M_PER_S, 0.8 * profile.macro.velocity_limit_m_per_s),
+        dwell_s=dwell_s,
+        dt_s=profile.cycle.period_s,
+        start_m=0.5 * (low_m + high_m - stroke_m),
+        lead_s=0.5,
+    )
+
+
+def drive(
+    stage: Supervisor,
+    trajectory: trajectories.Trajectory,
+    laws: Sequence[str] = LAWS,
+    identify_s: float = 20.0,
+    say: Say = lambda text: None,
+) -> Driven:
+    """Home, identify, follow the trajectory under each law; a motion that the guard ended is repeated once.
+
+    Ends at the first motion that fails twice. `say` hears what had to be repeated, when it happens.
+    """
+    flow = _Flow(stage, say)
+    if flow.does("home", stage.home) and _identifies(flow, stage, identify_s):
+        for law in laws:
+            if not flow.does(f"{trajectory.name} under {law}", lambda law=law: _follow(stage, trajectory, law)):
+                break
+    return Driven(tuple(flow.outcomes), tuple(flow.trips))
+
+
+def _identifies(flow: "_Flow", stage: Supervisor, duration_s: float) -> bool:
+    """Identify the joint and believe it; a stage without a micro has nothing to identify."""
+    if stage.profile.micro is None:
+        return True
+    if not flow.does("identify", lambda: _armed(stage, lambda: stage.identify(duration_s=duration_s))):
+        return False
+    estimate = flow.outcomes[-1].backlash
+    if estimate is not None and estimate.identifiable:
+        stage.take_backlash(estimate)
+    return True
+
+
+def _follow(stage: Supervisor, trajectory: trajectories.Trajectory, law: str) -> Outcome:
+    return _armed(stage, lambda: stage.run(trajectory, law), law)
+
+
+def _armed(stage: Supervisor, motion: Callable[[], Outcome], law: str | None = None) -> Outcome:
+    """Enable the drives where they are not, then move."""
+    stop = stage.enable(law)
+    if stop is not Stop.NONE:
+        return Outcome("enable", stop, stage.recorder.rows_count, 0)
+    return motion()
+
+
+class _Flow:
+    """Does one motion after the other and keeps how each ended."""
+
+    def __init__(self, stage: Supervisor, say: Say):
+        self._stage, self._say = stage, say
+        self.outcomes: list[Outcome] = []
+        self.trips: list[Trip] = []
+
+    def does(self, name: str, motion: Callable[[], Outcome]) -> bool:
+        """Move, once more where the guard ended it; tells whether the motion came to its own end."""
+        outcome = self._attempt(name, motion)
+        if not outcome.finished:
+            trip = Trip(name, outcome.stop)
+            self.trips.append(trip)
+            self._say(f"{trip.text}; acknowledging, arming again and repeating it once")
+            self._stage.acknowledge()
+            if outcome.stop is not Stop.REFERENCE_LOST or name == "home" or self._attempt("home", self._stage.home).finished:
+                outcome = self._attempt(name, motion)
+        self.outcomes.append(outcome)
+        return outcome.finished
+
+    def _attempt(self, name: str, motion: Callable[[], Outcome]) -> Outcome:
+        """Move; a stop between two parts of a motion is an end like any other."""
+        first_row = self._stage.recorder.rows_count
+        try:
+            return motion()
+        except RequestError:
+            status = self._stage.status()
+            if status["phase"] != Phase.STOPPED:
+                raise
+            rows = self._stage.recorder.rows_count - first_row
+            return Outcome(name, Stop(int(status["stop"])), first_row, rows)
