@@ -230,7 +230,7 @@ def step(b, cycle, macro_position_m, end_position_m, mean_force_n, q):
         side = -1.0
     elif abs(y) > max(b.force_share_ratio * b.greatest_force_n, least_n):
         side = 1.0 if y > 0.0 else -1.0
-        if side > 0.0 and b.right_sd_m < b.margin_m or side < 0.0 and b.left_sd_m < b.margin_m:
+        if (side > 0.0 and b.right_sd_m < b.margin_m) or (side < 0.0 and b.left_sd_m < b.margin_m):
             side = 0.0  # an edge that is known is gated by geometry alone
     b.held = b.held + 1.0 if side == b.side and side != 0.0 else 0.0
     b.side = side

@@ -9,6 +9,7 @@ from types import ModuleType
 import numpy as np
 
 from stagectl import compose, plant
+from stagectl.errors import RequestError
 from stagectl.signals import COMMAND, MEASUREMENT
 from stagectl.tick import Controller
 
@@ -28,6 +29,8 @@ DEVICES = np.dtype(
         ("macro_a", "f8"),  # commands that the drives hold
         ("micro_a", "f8"),
         ("sample", "f8"),  # number of the next sample
+        ("mean_from_s", "f8"),  # instant of the last sample, and the end's position integral there
+        ("mean_from_m_s", "f8"),
         ("late_sample", "f8"),  # whose line comes a cycle late; -1 = none
         ("late_macro_m", "f8"),
         ("late_end_m", "f8"),
@@ -59,10 +62,14 @@ def run(setpoints, noise_m, late, devices, state, parameters, machine_effects, m
     c = command[0]
     for k in range(setpoints.size):
         t_s = d.sample * d.period_s
-        before_s = s.t_s
-        area = s.end_position_integral_m_s
         plant_module.advance(state, parameters, machine_effects, t_s, d.longest_substep_s, d.macro_a, d.micro_a, 1, 1)
         truth[k].t_s = t_s
+        truth[k].end_mean_m = s.end_position_m - d.end_zero_m
+        if t_s > d.mean_from_s:
+            area_m_s = s.end_position_integral_m_s - d.mean_from_m_s
+            truth[k].end_mean_m = area_m_s / (t_s - d.mean_from_s) - d.end_zero_m
+        d.mean_from_s = t_s
+        d.mean_from_m_s = s.end_position_integral_m_s
         truth[k].macro_position_m = s.macro_position_m - d.macro_zero_m
         truth[k].end_position_m = s.end_position_m - d.end_zero_m
         truth[k].contact_force_n = s.contact_force_n
@@ -113,7 +120,6 @@ def run(setpoints, noise_m, late, devices, state, parameters, machine_effects, m
         next_s = d.sample * d.period_s
         plant_module.advance(state, parameters, machine_effects, next_s, d.longest_substep_s,
                              d.macro_a, d.micro_a, 1, 1)
-        truth[k].end_mean_m = (s.end_position_integral_m_s - area) / (s.t_s - before_s) - d.end_zero_m
         if c.stop != 0:
             return k + 1
     return setpoints.size
@@ -147,6 +153,8 @@ class Recording:
 
 def simulation(controller: Controller, machine, *, latch_delay_s: float, seed: int) -> Simulation:
     """Put a controller in front of a machine (attributes named as in a machine file)."""
+    if controller.estimator["position_mode"][0] != 0.0:
+        raise RequestError("macro.mode = 'position': the value seam has no drive that closes the loop; use the rig")
     machine_effects = [dict(row) for row in machine.effects]
     plant_module = compose.plant_module(machine_effects)
     source = (

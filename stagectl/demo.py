@@ -124,7 +124,11 @@ class _Flow:
             self.trips.append(trip)
             self._say(f"{trip.text}; acknowledging, arming again and repeating it once")
             self._stage.acknowledge()
-            if outcome.stop is not Stop.REFERENCE_LOST or name == "home" or self._attempt("home", self._stage.home).finished:
+            if (
+                outcome.stop is not Stop.REFERENCE_LOST
+                or name == "home"
+                or self._attempt("home", self._stage.home).finished
+            ):
                 outcome = self._attempt(name, motion)
         self.outcomes.append(outcome)
         return outcome.finished

@@ -72,8 +72,14 @@ def effect(*, places: tuple[str, ...], symptom: str, reference: str, **bounds: t
             raise TypeError(f"effect {name}: quantities come before parameters, got {arguments}")
         if unknown := [place for place in places if place not in PLACES]:
             raise TypeError(f"effect {name}: unknown place {unknown[0]}; choose from {PLACES}")
+        if "contact" in places and places != ("contact",):
+            raise TypeError(f"effect {name}: contact effects know no motion of an axis; declare it for contact alone")
+        if not inspect.getdoc(law):
+            raise TypeError(f"effect {name}: no docstring; its first line is the summary in reports")
         if set(bounds) != set(parameters):
             raise TypeError(f"effect {name}: bounds {sorted(bounds)} do not match parameters {sorted(parameters)}")
+        if wrong := [key for key, (low, high) in bounds.items() if not -np.inf < low < high < np.inf]:
+            raise TypeError(f"effect {name}: bounds of {wrong[0]} are no range: {bounds[wrong[0]]}")
         if nameless := [argument for argument in arguments if unit_of(argument) is None]:
             raise TypeError(f"effect {name}: argument {nameless[0]} states no unit")
         CATALOGUE[name] = Effect(

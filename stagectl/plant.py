@@ -34,7 +34,7 @@ PLANT_STATE = np.dtype(
         ("end_acceleration_m_per_s2", "f8"),
         ("macro_current_a", "f8"),
         ("micro_current_a", "f8"),
-        ("macro_force_n", "f8"),  # motor forces, mean over the last substep, before actuator effects
+        ("macro_force_n", "f8"),  # motor forces with actuator effects, mean over the last substep
         ("micro_force_n", "f8"),
         ("contact_force_n", "f8"),  # F_b of (5) with contact effects: retards the macro, drives the end
         ("macro_position_integral_m_s", "f8"),
@@ -304,7 +304,7 @@ def _stop_force(x, v, low, high, stiffness, damping):
 
 @inlined
 def joint_force(s, q, contact_effects_n):
-    """Return the force of spring, damping, contact and stroke stops on the end, at the middle; opposite on the macro."""
+    """Return the force of spring, damping, contact and stroke stops on the end at the middle, opposite on the macro."""
     relative_m = s.middle_end_position_m - s.middle_macro_position_m
     relative_m_per_s = s.middle_end_velocity_m_per_s - s.middle_macro_velocity_m_per_s
     force_n = -q.spring_n_per_m * relative_m - q.damping_n_s_per_m * relative_m_per_s

@@ -286,7 +286,9 @@ def _edges(identified: dict[str, float], true: dict[str, float] | None) -> tuple
     both_known = "left_m" in known
     sides = ("left", "right")
     return (
-        Edge("left edge", "m", -identified["left_m"], identified["left_sd_m"], -known["left_m"] if both_known else None),
+        Edge(
+            "left edge", "m", -identified["left_m"], identified["left_sd_m"], -known["left_m"] if both_known else None
+        ),
         Edge("right edge", "m", identified["right_m"], identified["right_sd_m"], known.get("right_m")),
         Edge(
             "width",

@@ -132,7 +132,11 @@ def tick(measurement, setpoint, later, command, e, model, ahead, after, l, g, b,
         c.macro_word = int(np.floor(macro_n / macro_step_n + 0.5))
         if q[0].has_micro != 0.0:
             c.micro_word = int(np.floor(micro_n / micro_step_n + 0.5))
-    c.macro_target_m = later[0].position_m - later[0].relative_position_m + reference.gap_centre(q[0])
+    goal = later[0]  # the drive interpolates: it arrives at a target one period after the SYNC that latches it
+    h = x.period_s
+    c.macro_target_m = reference.gap_centre(q[0]) + goal.position_m - goal.relative_position_m + h * (
+        goal.velocity_m_per_s - goal.relative_velocity_m_per_s
+        + 0.5 * h * (goal.acceleration_m_per_s2 - goal.relative_acceleration_m_per_s2))
     c.macro_force_n = c.macro_word * macro_step_n
     c.micro_force_n = c.micro_word * micro_step_n
     x.macro_word = c.macro_word

@@ -20,7 +20,9 @@ def show(voice: Voice, profile: str, backend: str, runs_root: Path, seed: int) -
     """Drive the demo, score it, write its report."""
     where = place(profile, backend, runs_root, seed)
     if where.is_value_seam:
-        raise RequestError("demo shows the whole way over the wire; take --backend rig, or `stagectl run --backend plant`")
+        raise RequestError(
+            "demo shows the whole way over the wire; take --backend rig, or `stagectl run --backend plant`"
+        )
     trajectory = demo.planned(where.profile)
     with opened(where, "demo", voice) as stage:
         driven = demo.drive(stage, trajectory, say=voice.warn)

@@ -58,25 +58,26 @@ def opened(where: Place, name: str, voice: Voice) -> Iterator[Supervisor]:
         seed=where.seed,
         progress=voice.progress,
     )
+    connected = False
     try:
         voice.note(f"{where.profile.name} on {stage.backend.description}")
         if where.backend == "auto" and stage.backend.name != "hardware":
             voice.note("auto: neither the profile's CAN interface nor its serial port is here, so the rig plays it")
         voice.run_folder = stage.folder
         stage.connect()
+        connected = True
         yield stage
     finally:
         voice.hush()
         try:
-            _rest(stage)
+            if connected:
+                _rest(stage)
         finally:
             stage.close()
 
 
 def _rest(stage: Supervisor) -> None:
     """Bring the stage to rest and keep what was true, while there is somebody who knows."""
-    if not stage.is_connected:
-        return
     stage.disarm()
     truth = stage.backend.truth()
     if truth is not None:
