@@ -6,23 +6,15 @@ Raw frames in Linux `struct can_frame` layout over SocketCAN or over the AF_UNIX
 
 import errno
 import socket
-import struct
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Protocol
 
+from drivers.can_frame import ERROR_FLAG, EXTENDED_FLAG, FILTER, FRAME, REMOTE_FLAG, STANDARD_MASK
+from drivers.hub_socket import connect_hub, filter_packet
 from stagectl.errors import LinkError
 
 if TYPE_CHECKING:
     import can
-
-FRAME = struct.Struct("=IB3x8s")  # id with flag bits, payload length, padding, data: 16 bytes
-FILTER = struct.Struct("=II")  # id, mask
-STATISTICS = struct.Struct("=QQ")  # frames relayed, frames lost for this client
-
-EXTENDED_FLAG = 0x80000000
-REMOTE_FLAG = 0x40000000
-ERROR_FLAG = 0x20000000
-STANDARD_MASK = 0x7FF
 
 # In a filter's mask these flags let standard data frames pass and nothing else. The error flag is
 # missing on purpose: the kernel keeps error frames in a list of their own, and reads the flag in a
@@ -193,42 +185,6 @@ def open_network(interface: str, channel: str) -> "can.BusABC":
         case "virtual":
             return _open_python_can("virtual", channel, filters)
     raise LinkError(_interface_text(interface))
-
-
-def connect_hub(path: str) -> socket.socket:
-    """Connect to the hub's socket; LinkError where nothing listens there."""
-    opened = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    try:
-        opened.connect(path)
-    except OSError as error:
-        opened.close()
-        raise LinkError(
-            f"CAN hub {path}: {error.strerror or error}; start the rig (python -m sim_backend ... --socket {path}) "
-            "or correct can.channel"
-        ) from error
-    return opened
-
-
-def filter_packet(filters: Iterable[tuple[int, int]]) -> bytes:
-    """Return the packet that asks the hub for frames with `id & mask` equal to one of `filters`; none = nothing."""
-    return b"FILT" + b"".join(FILTER.pack(can_id & mask, mask) for can_id, mask in filters)
-
-
-def hub_statistics(opened: socket.socket) -> tuple[int, int]:
-    """Ask the hub for (frames relayed, frames lost for this client); frames that arrive meanwhile are dropped.
-
-    For a socket of its own, without traffic; LinkError where no answer comes within a second.
-    """
-    opened.settimeout(1.0)
-    try:
-        opened.send(b"STAT")
-        while packet := opened.recv(_PACKET_LIMIT_BYTES):
-            if packet.startswith(b"STAT"):
-                relayed_count, lost_count = STATISTICS.unpack(packet[4:])
-                return relayed_count, lost_count
-    except OSError as error:
-        raise LinkError(_lost_text("CAN hub", error)) from error
-    raise LinkError(_packet_text("CAN hub", b""))
 
 
 def _open_socketcan(channel: str, filters: list[tuple[int, int]]) -> socket.socket:

@@ -9,14 +9,8 @@ from typing import Any
 
 import can
 
-from drivers.can_bus import (
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FRAME,
-    REMOTE_FLAG,
-    connect_hub,
-    filter_packet,
-)
+from drivers.can_frame import ERROR_FLAG, EXTENDED_FLAG, FRAME, REMOTE_FLAG
+from drivers.hub_socket import connect_hub, filter_packet
 
 _ID_MASK = 0x1FFFFFFF
 

@@ -6,7 +6,8 @@ Times are CLOCK_MONOTONIC_RAW: not slewed by NTP, so a line's arrival and a cycl
 import select
 import time
 
-from drivers.can_bus import ERROR_FLAG, CyclicBus
+from drivers.can_bus import CyclicBus
+from drivers.can_frame import ERROR_FLAG
 from drivers.serial_port import SerialPort
 from drivers.wire import Inbox
 from stagectl.errors import LinkError
@@ -50,7 +51,7 @@ class RealtimeTransport:
         inbox.sensor_bytes, self._kept = self._kept, b""
         while (left_ns := deadline_t_ns - now_t_ns()) > 0:
             # poll counts in whole milliseconds and rounds up: the last stretch is slept
-            if self._kept or left_ns < _POLL_NS and not self._poll.poll(0):
+            if self._kept or (left_ns < _POLL_NS and not self._poll.poll(0)):
                 time.sleep(left_ns * 1e-9)
             elif self._poll.poll(left_ns // _POLL_NS):
                 self._read(inbox)

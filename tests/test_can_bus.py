@@ -11,8 +11,9 @@ import sys
 import can
 import pytest
 
-from drivers import can_bus
-from drivers.can_bus import ERROR_FLAG, open_cyclic, open_network
+from drivers import hub_socket
+from drivers.can_bus import open_cyclic, open_network
+from drivers.can_frame import ERROR_FLAG, FILTER
 from drivers.hub_bus import HubBus
 from stagectl.errors import LinkError
 
@@ -165,10 +166,10 @@ def test_no_hub_names_place_and_remedy(tmp_path):
 
 def test_hub_statistics(peer):
     # "STAT" + u64 frames relayed 1000 = 0x3E8, u64 lost 2.
-    asking = can_bus.connect_hub(peer.path)
+    asking = hub_socket.connect_hub(peer.path)
     hub = peer.accept()
     hub.send(bytes.fromhex("53544154 E803000000000000 0200000000000000"))
-    assert can_bus.hub_statistics(asking) == (1000, 2)
+    assert hub_socket.hub_statistics(asking) == (1000, 2)
     assert hub.recv(64) == b"STAT"
     asking.close()
 
@@ -177,7 +178,7 @@ def test_network_filters_keep_process_data_and_sync_out(peer):
     bus = open_network("hub", peer.path)
     packet = peer.accept().recv(512)
     assert packet[:4] == b"FILT"
-    filters = [can_bus.FILTER.unpack_from(packet, place) for place in range(4, len(packet), 8)]
+    filters = [FILTER.unpack_from(packet, place) for place in range(4, len(packet), 8)]
 
     def passes(can_id):
         return any(can_id & mask == wanted & mask for wanted, mask in filters)
