@@ -442,7 +442,11 @@ CONTRADICTIONS = [
         "interferometer.frame.fields[3].valid_value",
         "outside the masks",
     ),
-    ({"interferometer.frame.fields[3].valid_mask": ABSENT}, "interferometer.frame.fields[3].valid_mask", "is missing"),
+    (
+        {"interferometer.frame.fields[3].macro_mask": ABSENT, "interferometer.frame.fields[3].end_mask": ABSENT},
+        "interferometer.frame.fields[3].valid_mask",
+        "is missing",
+    ),
     (
         {"interferometer.frame.fields[1].counts_per_wavelength": ABSENT},
         "interferometer.frame.fields[1].counts_per_wavelength",
