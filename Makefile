@@ -1,17 +1,29 @@
-# Two commands do everything on a fresh machine: `make demo` and `make test`.
+# Two commands do everything on a fresh machine: `make demo` and `make test`. Neither needs hardware or root.
 
 PYTHON ?= python3
 BIN := .venv/bin
+# PYTHONWARNINGS: what the build backend thinks of editable installs is no news to whoever types make.
+PIP_INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --disable-pip-version-check --retries 5 --timeout 60
 
 .PHONY: setup demo test check bench clean
 
 setup: .venv/.installed
 
+# A virtual environment without pip is one that was interrupted, or a Debian without python3-venv: made anew.
 .venv/.installed: pyproject.toml
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
-	touch $@
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "stagectl needs Python 3.11 or newer, and $(PYTHON) is: $$($(PYTHON) --version 2>&1)." >&2; \
+	  echo "Install one (Debian, Ubuntu: apt install python3 python3-venv), or name it: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; \
+	  exit 1; }
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { rm -rf .venv && $(PYTHON) -m venv .venv; } || { \
+	  rm -rf .venv; \
+	  echo "No virtual environment could be made; on Debian and Ubuntu: apt install python3-venv" >&2; \
+	  exit 1; }
+	@echo "installing into .venv (once; about 1 GB of disk, a minute or two)"
+	@$(PIP_INSTALL) --editable '.[dev]' || $(PIP_INSTALL) --editable '.[dev]' || { \
+	  echo "The packages could not be installed; what pip says above names the one, or the network." >&2; \
+	  exit 1; }
+	@touch $@
 
 demo: setup
 	$(BIN)/stagectl demo
@@ -29,4 +41,4 @@ bench: setup
 	$(BIN)/python -m bench main_job
 
 clean:
-	rm -rf .venv build *.egg-info
+	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis

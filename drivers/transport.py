@@ -12,9 +12,18 @@ from drivers.serial_port import SerialPort
 from drivers.wire import Inbox
 from stagectl.errors import LinkError
 
-_CHUNK_LIMIT_BYTES = 512  # what one row can hold; the rest comes with the next cycle
+CHUNK_LIMIT_BYTES = 512
+"""Sensor bytes of one cycle, what one row can hold; the rest comes with the next cycle."""
+
 _POLL_NS = 1_000_000
 _BUS_OFF = 0x40  # linux/can/error.h
+
+
+def error_frame_text(can_id: int) -> str:
+    """Say what an error frame means for good, empty where the bus goes on; `can_id` carries ERROR_FLAG."""
+    if can_id & _BUS_OFF:
+        return "CAN controller is bus-off: check cable, termination and bit rate, then arm again"
+    return ""
 
 
 def now_t_ns() -> int:
@@ -68,10 +77,9 @@ class RealtimeTransport:
         can_id, payload = frame
         if can_id & ERROR_FLAG:
             self.error_frames_count += 1
-            if can_id & _BUS_OFF:
-                self.failure = "CAN controller is bus-off: check cable, termination and bit rate, then arm again"
+            self.failure = error_frame_text(can_id) or self.failure
             return
-        setattr(inbox, self._names[can_id], payload)
+        inbox.take(self._names[can_id], payload)
 
     def _read(self, inbox: Inbox) -> None:
         inbox.sensor_arrival_t_ns = now_t_ns()
@@ -81,7 +89,7 @@ class RealtimeTransport:
             self.failure = str(error)
             self._poll.unregister(self._port.fileno())
             return
-        inbox.sensor_bytes, self._kept = data[:_CHUNK_LIMIT_BYTES], data[_CHUNK_LIMIT_BYTES:]
+        inbox.sensor_bytes, self._kept = data[:CHUNK_LIMIT_BYTES], data[CHUNK_LIMIT_BYTES:]
 
     def send(self, frames: list[tuple[int, bytes]]) -> tuple[bool, int]:
         """Queue frames in this order; a full queue is a missed command, never sent again."""

@@ -17,12 +17,14 @@ from drivers.arming import SYNC_ID, DriveMapping
 from drivers.framers import framer_for
 from drivers.reading import END_VALID, MACRO_VALID, REFERENCE_LOST, RESTARTED, Reading
 from drivers.scale import counts_per_wavelength_of, metres_per_count
+from stagectl.errors import LinkError
 
 SERVO_NODE_ID = 0x7E
 HEARTBEAT_FRAME = (0x700 + SERVO_NODE_ID, b"\x05")
 SYNC_FRAME = (SYNC_ID, b"")
 
 BOTH_VALID = MACRO_VALID | END_VALID
+_NO_ERROR = b"\0\0"  # an EMCY that takes the one before back
 _DISAGREEMENTS_IN_A_ROW = 5  # a host that holds a SYNC up by a millisecond is no lost reference
 _EARLIEST_SHARE = 0.5  # of the transport's constant part: no line of a sample younger than this can be there
 
@@ -43,6 +45,12 @@ class Inbox:
     micro_emcy: bytes | None = None
 
     FRAMES = ("macro_tpdo", "micro_tpdo", "macro_inputs_tpdo", "micro_inputs_tpdo", "macro_emcy", "micro_emcy")
+
+    def take(self, name: str, payload: bytes) -> None:
+        """Keep a frame; of several in one cycle the newest, but an emergency stays until it was seen."""
+        if name.endswith("_emcy") and getattr(self, name) is not None and payload[:2] == _NO_ERROR:
+            return
+        setattr(self, name, payload)
 
     def clear(self) -> None:
         """Forget the cycle before."""
@@ -87,11 +95,14 @@ class WireDecoder:
         self.sequence = -1
         self.cycle = -1
         self.reference_lost = 0
+        self.reference_text = ""  # why it was lost, for people
         self.encoder_trusted = False  # only after a homing do laser and encoder share a zero
         self.samples_lost = 0
         self._compared_sequence = -2
         self._compared_m = 0.0
         self._disagreements = 0
+        self._macro_moved = (math.nan, math.nan)  # counts of each axis when they last changed, and the encoder then
+        self._end_moved = (math.nan, math.nan)
         self._earliest_ns = _EARLIEST_SHARE * sensor.transport_s * 1e9
         self._jump_m = sensor.jump_limit_m
         self._disagreement_m = sensor.encoder_disagreement_m
@@ -115,7 +126,7 @@ class WireDecoder:
     def _take_reading(self, reading: Reading) -> bool:
         """Take one reading; returns whether it is a valid sample of both axes."""
         if reading.flags & REFERENCE_LOST:
-            self.reference_lost = 1
+            self._lose_reference(_loss_text(reading.flags, self._single))
         wanted = MACRO_VALID if self._single else BOTH_VALID
         if reading.flags & wanted != wanted:
             return False
@@ -129,7 +140,7 @@ class WireDecoder:
                 abs(reading.macro_counts - self.macro_counts) * self.macro_m_per_count <= reach_m
                 and (self._single or abs(reading.end_counts - self.end_counts) * self.end_m_per_count <= reach_m)
             ):
-                self.reference_lost = 1
+                self._lose_reference(self._jump_text(reading, reach_m))
         self.sequence = reading.sequence
         self.macro_counts = reading.macro_counts
         self.end_counts = reading.macro_counts if self._single else reading.end_counts
@@ -138,36 +149,57 @@ class WireDecoder:
             self.end_zero_counts = self.end_counts
         return True
 
+    def _lose_reference(self, text: str) -> None:
+        """Latch it; the first cause stays."""
+        if not self.reference_lost:
+            self.reference_text = text
+        self.reference_lost = 1
+
+    def _jump_text(self, reading: Reading, reach_m: float) -> str:
+        macro_m = abs(reading.macro_counts - self.macro_counts) * self.macro_m_per_count
+        end_m = 0.0 if self._single else abs(reading.end_counts - self.end_counts) * self.end_m_per_count
+        axis, jump_m = ("macro", macro_m) if macro_m > reach_m else ("end", end_m)
+        return f"{axis} jumped by {jump_m * 1e3:.3g} mm between two samples, {reach_m * 1e3:.3g} mm are possible"
+
     def _take_frames(self, inbox: Inbox, m: np.ndarray) -> None:
-        """Decode process data, inputs and emergencies; LinkError on a short PDO, nothing of it taken."""
+        """Decode process data, inputs and emergencies; LinkError on a short frame, nothing of it taken."""
         fresh = 0
+        m["tpdos_new"][0] = 0
         for axis, (codec, status, position, torque, step_m, force_n, bit, node_id) in self._axes.items():
             payload = inbox.macro_tpdo if bit == 1 else inbox.micro_tpdo
             if payload is not None:
-                values = codec.decode(payload)
+                values = _decoded(codec, payload, f"{axis} (node {node_id})")
                 m[f"{axis}_statusword"][0] = values[status]
                 m[f"{axis}_encoder_m"][0] = values[position] * step_m
                 m[f"{axis}_reported_force_n"][0] = values[torque] * force_n
                 fresh |= bit
             payload = inbox.macro_inputs_tpdo if bit == 1 else inbox.micro_inputs_tpdo
             if payload is not None:
-                m[f"{axis}_digital_inputs"][0] = self.mappings[axis].inputs_tpdo.decode(payload)[0]
+                inputs = self.mappings[axis].inputs_tpdo
+                m[f"{axis}_digital_inputs"][0] = _decoded(inputs, payload, f"inputs of {axis} (node {node_id})")[0]
             payload = inbox.macro_emcy if bit == 1 else inbox.micro_emcy
             if payload is not None:
                 code = cia402.decode_emergency(payload)[0]
                 m["emergency"][0] = node_id << 16 | code if code else 0
         m["tpdos_new"][0] = fresh
 
-    def decode(self, inbox: Inbox, m: np.ndarray) -> None:
-        """Write what the inbox says into a MEASUREMENT; lease, overrun and lost commands are the caller's."""
+    def decode(self, inbox: Inbox, m: np.ndarray) -> str:
+        """Write what the inbox says into a MEASUREMENT; lease, overrun and lost commands are the caller's.
+
+        Returns what is wrong where a drive's frame can't be what was agreed, else an empty text.
+        """
         valid = 0
+        text = ""
         if inbox.sensor_bytes:
             for reading in self.framer.feed(inbox.sensor_bytes):
                 sample_clock.step(self.clock, reading.sequence, inbox.sensor_arrival_t_ns)
                 if reading.flags & RESTARTED:
                     self.cycle = -1
                 valid += self._take_reading(reading)
-        self._take_frames(inbox, m)
+        try:
+            self._take_frames(inbox, m)
+        except LinkError as error:
+            text = str(error)
         m["t_ns"][0] = inbox.t_ns
         m["samples_new"][0] = valid
         m["sequence"][0] = self.sequence
@@ -178,10 +210,28 @@ class WireDecoder:
             m["sample_t_ns"][0] = sample_clock.sample_t_ns(self.clock, self.sequence)
             m["macro_position_m"][0] = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
             m["end_position_m"][0] = (self.end_counts - self.end_zero_counts) * self.end_m_per_count
+            if valid and self.encoder_trusted and m["tpdos_new"][0] & 1:
+                self._look_for_stuck_counts(float(m["macro_encoder_m"][0]))
             if valid and self.sequence == self.cycle:  # behind a late line the drive's position is of a later SYNC
                 self._compare_with_encoder(m, inbox.sync_t_ns)
         m["cycle"][0] = self.cycle
         m["reference_lost"][0] = self.reference_lost
+        return text
+
+    def _look_for_stuck_counts(self, encoder_m: float) -> None:
+        """Latch *reference lost* where an axis repeats its counts, to the last bit, while the drive moves."""
+        if self.macro_counts != self._macro_moved[0]:
+            self._macro_moved = (self.macro_counts, encoder_m)
+        if self.end_counts != self._end_moved[0]:
+            self._end_moved = (self.end_counts, encoder_m)
+        for axis, (_, moved_m) in (("macro", self._macro_moved), ("end", self._end_moved)):
+            if not abs(encoder_m - moved_m) <= self._disagreement_m:
+                away_um = abs(encoder_m - moved_m) * 1e6
+                self._lose_reference(
+                    f"{axis} counts are stuck: the drive's encoder moved {away_um:.0f} um meanwhile, "
+                    f"limit {self._disagreement_m * 1e6:.0f} um"
+                )
+                break
 
     def _compare_with_encoder(self, m: np.ndarray, sync_t_ns: int) -> None:
         """Latch *reference lost* where laser and drive disagree for several cycles, both at the last SYNC's instant.
@@ -200,7 +250,11 @@ class WireDecoder:
             else:
                 self._disagreements += 1
                 if self._disagreements >= _DISAGREEMENTS_IN_A_ROW:
-                    self.reference_lost = 1
+                    away_um = abs(laser_m - float(m["macro_encoder_m"][0])) * 1e6
+                    self._lose_reference(
+                        f"macro laser and the drive's encoder differ by {away_um:.0f} um, "
+                        f"limit {allowed_m * 1e6:.0f} um"
+                    )
         self._compared_sequence = self.sequence
         self._compared_m = macro_m
 
@@ -211,7 +265,9 @@ class WireDecoder:
         self.macro_zero_counts = macro_zero_counts
         self.end_zero_counts = end_zero_counts
         self.reference_lost = 0
+        self.reference_text = ""
         self.encoder_trusted = True
+        self._macro_moved = self._end_moved = (math.nan, math.nan)
         self._compared_sequence = -2
         self._disagreements = 0
         return macro_shift_m, end_shift_m
@@ -235,6 +291,8 @@ class WireDecoder:
         "_compared_sequence",
         "_compared_m",
         "_disagreements",
+        "_macro_moved",
+        "_end_moved",
     )
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -252,6 +310,24 @@ class WireDecoder:
             setattr(self, name, value)
         self.framer.restore(bytes(snapshot["decoder_framer"]))
         self.clock[...] = snapshot["decoder_clock"]
+
+
+def _decoded(codec, payload: bytes, source: str) -> tuple[int, ...]:
+    """Decode a PDO; LinkError says whose."""
+    try:
+        return codec.decode(payload)
+    except LinkError as error:
+        raise LinkError(f"{source}: {error}") from error
+
+
+def _loss_text(flags: int, single: bool) -> str:
+    """Say what a reading's flags mean for the reference."""
+    if flags & RESTARTED:
+        return "the interferometer restarted: its numbers went back"
+    dark = [name for name, bit in (("macro", MACRO_VALID), ("end", END_VALID)) if not flags & bit]
+    if single and "end" in dark:
+        dark.remove("end")
+    return f"no beam on {' and '.join(dark)}" if dark else "the interferometer says that a counter was reset"
 
 
 class WireEncoder:

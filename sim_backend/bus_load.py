@@ -11,7 +11,6 @@ from stagectl.errors import LinkError
 INTERMISSION_BITS = 3
 _CRC_POLYNOMIAL = 0x4599  # CRC-15 of ISO 11898-1
 _NEVER_NS = 1 << 62
-_NO_ID = 1 << 30
 _TRAILER_BITS = 13  # CRC delimiter, ACK slot and delimiter, 7 of end of frame, 3 of intermission: never stuffed
 
 
@@ -70,11 +69,14 @@ class BusModel:
         self._free_t_ns = 0
         self._queues: list[deque[tuple[int, int, bytes]]] = [deque() for _ in range(stations_count)]
         self._next: tuple[int, int, int] | None = None  # delivery, free again, station; None = not worked out
+        self._start_t_ns = 0  # of the frame in `_next`
 
     def submit(self, station: int, ready_t_ns: int, can_id: int, payload: bytes) -> None:
         """Queue a frame; it takes part in arbitration from `ready_t_ns`."""
-        self._queues[station].append((ready_t_ns, can_id, payload))
-        self._next = None
+        queue = self._queues[station]
+        if not queue and ready_t_ns <= self._start_t_ns:
+            self._next = None  # it may be first: a frame behind others, or after the next one's start, is not
+        queue.append((ready_t_ns, can_id, payload))
 
     def queued(self, station: int) -> int:
         """Return how many frames wait at a station, the one on the wire included."""
@@ -109,19 +111,22 @@ class BusModel:
 
     def _arbitrate(self) -> None:
         """Find the head that wins: the lowest id of those ready when the bus is free."""
-        ready_t_ns = _NEVER_NS
-        for queue in self._queues:
-            if queue and queue[0][0] < ready_t_ns:
-                ready_t_ns = queue[0][0]
-        if ready_t_ns == _NEVER_NS:
-            return
-        start_t_ns = max(self._free_t_ns, ready_t_ns)
-        can_id, payload, station = _NO_ID, b"", 0
+        start_t_ns = _NEVER_NS
+        heads = []
         for number, queue in enumerate(self._queues):
             if queue:
                 ready_t_ns, head_id, data = queue[0]
-                if ready_t_ns <= start_t_ns and head_id < can_id:
-                    can_id, payload, station = head_id, data, number
+                heads.append((head_id, ready_t_ns, number, data))
+                if ready_t_ns < start_t_ns:
+                    start_t_ns = ready_t_ns
+        if not heads:
+            return
+        if start_t_ns < self._free_t_ns:
+            start_t_ns = self._free_t_ns
+        if len(heads) > 1:
+            heads = [min([head for head in heads if head[1] <= start_t_ns])]
+        can_id, _, station, payload = heads[0]
+        self._start_t_ns = start_t_ns
         if self._bit_ns == 0.0:
             self._next = (start_t_ns, start_t_ns, station)
             return

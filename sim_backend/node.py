@@ -184,6 +184,7 @@ class DriveNode:
         self._tpdos = [process_data.read(self._dictionary, self.objects, *pair) for pair in _TPDO]
         self.sync_cob_id = self.objects[_SYNC_KEY] & 0x7FF
         self._rpdo_of = {pdo.cob_id: pdo for pdo in self._rpdos if pdo.exists}
+        self._sync_rpdos = [pdo for pdo in self._rpdos if pdo.exists and pdo.synchronous]
         self._sync_tpdos = [pdo for pdo in self._tpdos if pdo.exists and pdo.synchronous]
         self._event_tpdos = [pdo for pdo in self._tpdos if pdo.exists and not pdo.synchronous]
 
@@ -273,8 +274,8 @@ class DriveNode:
         period_us = self.objects[_CYCLE_PERIOD]
         if period_us:
             self._sync_t_ns = t_ns + 1000 * period_us * _SYNC_LOST_PERIODS
-        for pdo in self._rpdos:
-            if pdo.pending is not None and pdo.synchronous and pdo.exists:
+        for pdo in self._sync_rpdos:
+            if pdo.pending is not None:
                 self._latch(pdo)
         drive = self.drive
         if drive.is_busy:

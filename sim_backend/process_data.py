@@ -4,8 +4,9 @@ Written from CiA 301 for the drive's side; shares nothing with the controller's 
 """
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from operator import itemgetter
 
 import canopen
 from canopen.objectdictionary import ODVariable
@@ -60,6 +61,7 @@ class ProcessData:
     event_ns: int
     keys: tuple[int, ...]
     codec: struct.Struct
+    values_of: Callable[[Mapping[int, int]], tuple[int, ...]]  # the values of `keys`
     pending: tuple[int, ...] | None = field(default=None)  # RPDO: received, waits for its SYNC
     last_payload: bytes = b""  # TPDO: what was sent last
     last_sent_t_ns: int = -(1 << 62)
@@ -72,7 +74,14 @@ class ProcessData:
 
     def payload(self, objects: Mapping[int, int]) -> bytes:
         """Pack the present values."""
-        return self.codec.pack(*[objects[k] for k in self.keys])
+        return self.codec.pack(*self.values_of(objects))
+
+
+def _getter(keys: list[int]) -> Callable[[Mapping[int, int]], tuple[int, ...]]:
+    """Return the quickest way from objects to the tuple of their values."""
+    if len(keys) > 1:
+        return itemgetter(*keys)
+    return lambda objects: tuple([objects[k] for k in keys])
 
 
 def read(
@@ -98,4 +107,5 @@ def read(
         event_ns=1_000_000 * objects.get(key(communication, 5), 0),
         keys=tuple(keys),
         codec=struct.Struct(letters),
+        values_of=_getter(keys),
     )

@@ -8,6 +8,8 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
 from sim_backend import drive_servo, object_dictionary
 from sim_backend.drive import Drive
 from sim_backend.faults import BUS_KINDS, Fault, FaultSchedule, WireFaults
@@ -15,6 +17,7 @@ from sim_backend.interferometer import END_BIT, MACRO_BIT, Interferometer
 from sim_backend.node import DriveNode
 from sim_backend.truth import TruthLog
 from stagectl import compose, plant
+from stagectl.compiled import direct
 
 START_T_NS = 1_000_000_000
 SUBSTEP_S = 50e-6  # the longest
@@ -79,8 +82,9 @@ class Rig:
         self._plant_parameters = plant.parameters(machine, seed)
         self._effect_parameters = compose.effect_parameters(self._effects)
         module = compose.plant_module(self._effects)
-        self._advance = compose.generated_module("rig", _ADVANCE.format(plant_module=module.__name__)).advance
+        rig_module = compose.generated_module("rig", _ADVANCE.format(plant_module=module.__name__))
         self._state = plant.init(machine)
+        self._flat = self._state.view(np.float64)  # all fields are eight bytes wide, floats
         self._names = {name: k for k, name in enumerate(plant.PLANT_STATE.names or ())}
         state = self.plant_state()
         macro_m, end_m = state["macro_position_m"], state["end_position_m"]
@@ -89,13 +93,23 @@ class Rig:
             self.nodes.append(self._node(machine.micro, "micro", end_m - macro_m))
         self._macro_drive = self.nodes[0].drive
         self._micro_drive = self.nodes[-1].drive  # a stage without micro hands its macro twice; it is not stepped then
+        self._arrays = (
+            self._state,
+            self._plant_parameters,
+            self._effect_parameters,
+            self._macro_drive.servo,
+            self._macro_drive.servo_parameters,
+            self._micro_drive.servo,
+            self._micro_drive.servo_parameters,
+        )
+        self._advance = direct(rig_module.advance, *self._arrays, 0.0, SUBSTEP_S)
         self.interferometer = Interferometer(machine, seed, start_t_ns, macro_m, end_m)
         self._lines: deque[tuple[int, bytes]] = deque()
         self._frames: list[tuple[int, int, bytes]] = []
         self._faults = FaultSchedule(faults, start_t_ns)
         self._stuck_statuswords: dict[int, bytes] = {}
         self._last_sample: tuple[int, float, float] | None = None
-        self._next_t_ns = start_t_ns
+        self.next_event_t_ns = start_t_ns  # of the next event inside the rig, not of a line's arrival
         self.next_timer_t_ns = start_t_ns  # of drives and faults, samples left out
         self._columns = tuple(
             self._names[name]
@@ -109,9 +123,10 @@ class Rig:
                 "contact_force_n",
                 "macro_force_n",
                 "micro_force_n",
-                "macro_current_a",
-                "micro_current_a",
             )
+        )
+        self._motor_columns = tuple(
+            self._names[name] for name in ("macro_position_m", "end_position_m", "macro_current_a", "micro_current_a")
         )
         for node in self.nodes:
             self._collect(start_t_ns, node.on_time(start_t_ns, 0.0, 0.0))
@@ -129,14 +144,12 @@ class Rig:
         """Return the true state by name (`stagectl.plant.PLANT_STATE`)."""
         return dict(zip(self._names, self._state.item(), strict=True))
 
-    def _values(self) -> tuple[float, ...]:
-        state = self._state.item()
-        return tuple([state[k] for k in self._columns])
-
     def _motors(self) -> tuple[tuple[float, float], ...]:
         """Return (position of the motor's encoder, current) of each node."""
-        values = self._values()
-        return (values[0], values[9]), (values[1] - values[0], values[10])
+        value = self._flat.item
+        macro, end, macro_current, micro_current = self._motor_columns
+        macro_m = value(macro)
+        return (macro_m, value(macro_current)), (value(end) - macro_m, value(micro_current))
 
     def _place_nodes(self) -> None:
         for node, motor in zip(self.nodes, self._motors(), strict=False):
@@ -152,17 +165,7 @@ class Rig:
         """Advance plant and servos to `t_ns` exactly."""
         if t_ns <= self.t_ns:
             return
-        self._advance(
-            self._state,
-            self._plant_parameters,
-            self._effect_parameters,
-            self._macro_drive.servo,
-            self._macro_drive.servo_parameters,
-            self._micro_drive.servo,
-            self._micro_drive.servo_parameters,
-            1e-9 * (t_ns - self.start_t_ns),
-            SUBSTEP_S,
-        )
+        self._advance(*self._arrays, 1e-9 * (t_ns - self.start_t_ns), SUBSTEP_S)
         self.t_ns = t_ns
 
     def _plan(self) -> None:
@@ -172,12 +175,7 @@ class Rig:
         if fault_t_ns is not None and fault_t_ns < due:
             due = fault_t_ns
         self.next_timer_t_ns = due
-        self._next_t_ns = min(due, self.interferometer.next_sample_t_ns)
-
-    @property
-    def next_event_t_ns(self) -> int:
-        """Instant of the next event inside the rig (not of a line's arrival)."""
-        return self._next_t_ns
+        self.next_event_t_ns = min(due, self.interferometer.next_sample_t_ns)
 
     @property
     def next_wake_t_ns(self) -> int:
@@ -186,13 +184,13 @@ class Rig:
 
     def advance(self, t_ns: int) -> None:
         """Let everything happen up to and including `t_ns`; the plant stands there afterwards."""
-        if self._next_t_ns <= t_ns:
+        if self.next_event_t_ns <= t_ns:
             self._run_events(t_ns)
         self._move_plant(t_ns)
 
     def _run_events(self, t_ns: int) -> None:
-        while self._next_t_ns <= t_ns:
-            now_t_ns = self._next_t_ns
+        while self.next_event_t_ns <= t_ns:
+            now_t_ns = self.next_event_t_ns
             self._move_plant(now_t_ns)
             for begins, fault in self._faults.due(now_t_ns):
                 self._change_fault(begins, fault, now_t_ns)
@@ -216,7 +214,7 @@ class Rig:
         sync = can_id == self.nodes[0].sync_cob_id
         if sync or can_id == 0x000 or can_id & 0x780 == 0x600:
             self.advance(t_ns)
-        elif self._next_t_ns <= t_ns:
+        elif self.next_event_t_ns <= t_ns:
             self._run_events(t_ns)
         answers: list[tuple[int, bytes]] = []
         if sync:
@@ -259,9 +257,9 @@ class Rig:
     # -- sensor -------------------------------------------------------------------------------------------------------
 
     def _take_sample(self, t_ns: int) -> None:
-        values = self._values()
-        macro_m, end_m, macro_m_per_s, end_m_per_s, macro_integral, end_integral, contact_n, macro_n, micro_n = values[
-            :9
+        state = self._flat.tolist()
+        macro_m, end_m, macro_m_per_s, end_m_per_s, macro_integral, end_integral, contact_n, macro_n, micro_n = [
+            state[k] for k in self._columns
         ]
         interferometer = self.interferometer
         sequence = interferometer.next_sequence

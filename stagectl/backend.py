@@ -21,8 +21,9 @@ import can
 import numpy as np
 
 from drivers.arming import DriveMapping
-from drivers.can_bus import connect_hub, open_network
-from drivers.transport import now_t_ns
+from drivers.hub_socket import connect_hub
+from drivers.can_bus import ERROR_FLAG, open_network
+from drivers.transport import CHUNK_LIMIT_BYTES, error_frame_text, now_t_ns
 from drivers.wire import Inbox, WireDecoder, WireEncoder, frame_names
 from sim_backend.batch import BatchWire
 from sim_backend.rig import Rig
@@ -105,6 +106,8 @@ class BatchTransport:
         """Take over a batch wire."""
         self._wire, self._names, self._tick_ns = wire, names, tick_ns
         wire.cyclic.set_ids(names)
+        self._kept = b""  # read already, but beyond what one row holds
+        self._port_failed = False
         self.failure = ""
 
     @property
@@ -119,22 +122,26 @@ class BatchTransport:
     def receive(self, deadline_t_ns: int, inbox: Inbox) -> int:
         """Let everything happen until the deadline, line by line, so that each has its own arrival."""
         wire = self._wire
-        while (line_t_ns := wire.next_line_t_ns()) <= deadline_t_ns and len(inbox.sensor_bytes) < 256:
+        inbox.sensor_bytes, self._kept = self._kept[:CHUNK_LIMIT_BYTES], self._kept[CHUNK_LIMIT_BYTES:]
+        while not self._kept and not self._port_failed and (line_t_ns := wire.next_line_t_ns()) <= deadline_t_ns:
             wire.advance_to(line_t_ns)
             try:
                 data = wire.serial.read()
             except LinkError as error:
                 self.failure = str(error)
+                self._port_failed = True
                 break
             if not data:
                 break
-            inbox.sensor_bytes += data
+            data = inbox.sensor_bytes + data
+            inbox.sensor_bytes, self._kept = data[:CHUNK_LIMIT_BYTES], data[CHUNK_LIMIT_BYTES:]
             inbox.sensor_arrival_t_ns = wire.serial.arrival_t_ns
         wire.advance_to(deadline_t_ns)
         while (frame := wire.cyclic.receive()) is not None:
-            name = self._names.get(frame[0])
-            if name is not None:
-                setattr(inbox, name, frame[1])
+            if frame[0] & ERROR_FLAG:
+                self.failure = error_frame_text(frame[0]) or self.failure
+            elif frame[0] in self._names:
+                inbox.take(self._names[frame[0]], frame[1])
         return wire.t_ns
 
     def send(self, frames: list[tuple[int, bytes]]) -> tuple[bool, int]:

@@ -44,6 +44,14 @@ def compiled(function):
     return numba.njit(cache=True, error_model="numpy", nogil=True)(function)
 
 
+def direct(function, *arguments):
+    """Return what `compiled` made of a function for these arguments' types, without the look at types in each call.
+
+    That look costs 0.2 us for each structured array. Only for callers whose arrays never change their dtypes.
+    """
+    return function.compile(tuple(numba.typeof(argument) for argument in arguments))
+
+
 def inlined(function):
     """Compile as `compiled` does, and melt into every compiled caller: for small functions of the innermost loop."""
     return numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)(function)

@@ -61,7 +61,7 @@ def planned(profile: Profile, dwell_s: float = DWELL_S) -> trajectories.Trajecto
         dwell_s=dwell_s,
         dt_s=profile.cycle.period_s,
         start_m=0.5 * (low_m + high_m - stroke_m),
-        lead_s=0.5,
+        lead_s=0.5,  # the move that leads there swings out
     )
 
 

@@ -30,7 +30,7 @@ CONTACT_QUANTITIES = ("penetration_m", "penetration_velocity_m_per_s")
 """What a contact effect may depend on: overlap of the joint's two parts (> 0 in contact) and its rate."""
 
 PLACES = ("macro_force", "micro_force", "contact", "macro_actuator", "micro_actuator")
-"""Where an effect may act. Actuator effects add to what the current should make; contact effects to the push of the joint."""
+"""Where an effect may act: an actuator effect adds to what the current should make, a contact effect to the joint."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,7 @@ GUARD = np.dtype(
         ("input_trip_mask", "f8"),
         ("velocity_share", "f8"),
         ("has_micro", "f8"),
+        ("braking", "f8"),  # 1 in a guided stop: the macro is brought to rest by its drive, only the micro is trusted
         ("has_drives", "f8"),  # 0 behind the value seam: no statusword, inputs, TPDOs
         ("period_s", "f8"),
         ("started", "f8"),
@@ -105,23 +106,31 @@ def init(profile, *, has_drives: bool) -> np.ndarray:
 @compiled
 def _drives_stop(g, m):
     """Return why the drives' own words end the run."""
-    if m.emergency != 0:
-        return _EMERGENCY
     trip = int(g.input_trip_mask)
-    inputs = m.macro_digital_inputs | m.micro_digital_inputs
-    if inputs & trip != 0:
-        return _DIGITAL_INPUT
-    g.macro_silence = 0.0 if m.tpdos_new & 1 else g.macro_silence + 1.0
-    g.micro_silence = 0.0 if m.tpdos_new & 2 or g.has_micro == 0.0 else g.micro_silence + 1.0
-    if not (g.macro_silence <= g.silent_cycles and g.micro_silence <= g.silent_cycles):
-        return _LINK_SILENT
-    if m.macro_statusword & _STATE_MASK != _OPERATION_ENABLED:
-        return _DRIVE_FAULT
-    if g.has_micro != 0.0 and m.micro_statusword & _STATE_MASK != _OPERATION_ENABLED:
-        return _DRIVE_FAULT
+    if g.braking != 0.0:  # why it brakes is known, and the macro's drive no longer takes part
+        if m.micro_digital_inputs & trip != 0:
+            return _DIGITAL_INPUT
+    else:
+        if (m.macro_digital_inputs | m.micro_digital_inputs) & trip != 0:
+            return _DIGITAL_INPUT
+        if m.emergency != 0:
+            return _EMERGENCY
     g.commands_lost = g.commands_lost + 1.0 if m.command_lost != 0 else 0.0
     if not g.commands_lost <= g.lost_commands:
         return _COMMAND_LOST
+    if m.command_lost == 0:  # a SYNC that did not go out has no answer
+        g.macro_silence = 0.0 if m.tpdos_new & 1 else g.macro_silence + 1.0
+        g.micro_silence = 0.0 if m.tpdos_new & 2 or g.has_micro == 0.0 else g.micro_silence + 1.0
+    if not g.micro_silence <= g.silent_cycles:
+        return _LINK_SILENT
+    if g.has_micro != 0.0 and m.micro_statusword & _STATE_MASK != _OPERATION_ENABLED:
+        return _DRIVE_FAULT
+    if g.braking != 0.0:
+        return _NONE
+    if not g.macro_silence <= g.silent_cycles:
+        return _LINK_SILENT
+    if m.macro_statusword & _STATE_MASK != _OPERATION_ENABLED:
+        return _DRIVE_FAULT
     return _NONE
 
 
@@ -140,6 +149,10 @@ def _motion_stop(g, m, now):
         g.macro_velocity_m_per_s += g.velocity_share * (rate - g.macro_velocity_m_per_s)
         g.macro_position_m = m.macro_position_m
         g.cycle = m.cycle
+    if g.has_micro != 0.0 and not g.stroke_low_m <= m.end_position_m - m.macro_position_m <= g.stroke_high_m:
+        return _MICRO_STROKE
+    if g.braking != 0.0:
+        return _NONE
     v = g.macro_velocity_m_per_s
     if not g.travel_low_m <= m.macro_position_m <= g.travel_high_m:
         return _TRAVEL
@@ -151,8 +164,6 @@ def _motion_stop(g, m, now):
     # A late line leaves the position of the cycle before, a whole step behind; its age is watched by itself.
     if fresh and not abs(m.end_position_m - now.position_m) <= g.following_error_m:
         return _FOLLOWING_ERROR
-    if g.has_micro != 0.0 and not g.stroke_low_m <= m.end_position_m - m.macro_position_m <= g.stroke_high_m:
-        return _MICRO_STROKE
     return _NONE
 
 
@@ -171,10 +182,11 @@ def step(g, m, now, macro_n, micro_n):
         return _REFERENCE_LOST
     if not m.t_ns - m.sample_t_ns <= g.sensor_age_ns:
         return _SENSOR_AGE
-    if not m.overrun_ns <= g.overrun_ns:
-        return _OVERRUN
-    if not m.lease_left_ns > 0:
-        return _LEASE
+    if g.braking == 0.0:
+        if not m.overrun_ns <= g.overrun_ns:
+            return _OVERRUN
+        if not m.lease_left_ns > 0:
+            return _LEASE
     if g.has_drives != 0.0:
         stop = _drives_stop(g, m)
         if stop != _NONE:
@@ -182,6 +194,8 @@ def step(g, m, now, macro_n, micro_n):
     stop = _motion_stop(g, m, now)
     if stop != _NONE:
         return stop
+    if g.braking != 0.0:
+        return _NONE
     g.macro_heat_n2 += g.macro_thermal_share * (macro_n * macro_n - g.macro_heat_n2)
     if not g.macro_heat_n2 <= g.macro_thermal_n * g.macro_thermal_n:
         return _THERMAL

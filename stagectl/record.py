@@ -159,7 +159,8 @@ class Recorder:
             grown = np.zeros(max(end, 2 * len(self._pending)), ROW)
             grown[: self._pending_count] = self._pending[: self._pending_count]
             self._pending = grown
-        self._pending[self._pending_count : end] = rows
+        # As bytes: numpy copies structured rows field by field, 2 us each.
+        self._pending[self._pending_count : end].view(np.uint8)[:] = np.ascontiguousarray(rows).view(np.uint8)
         self._pending_count = end
         self.rows_count += count
         span_ns = self._last_t_ns - int(self._pending["t_ns"][0])

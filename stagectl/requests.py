@@ -44,6 +44,7 @@ REQUEST = np.dtype(
     [
         ("counter", "i8"),  # alive: changes all the time
         ("mode", "i8"),  # Mode
+        ("stop", "i8"),  # with Mode.STOP, the Stop that the supervisor has a reason for; NONE = the operator
         ("law_number", "i8"),  # place in stagectl.tick.LAWS
         ("segment_number", "i8"),  # a change starts the segment
         ("segment_start", "i8"),  # its first row in the segment table

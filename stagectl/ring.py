@@ -342,6 +342,7 @@ class RequestWriter:
     def __init__(self, path: Path | None, dtype: np.dtype):
         self.memory = _create(path, _REQUEST_MAGIC, dtype, 1, "")
         self.value = np.zeros(1, dtype)
+        self._bytes = self.value.view(np.uint8)  # numpy copies field by field otherwise: 6 us
         _publish(np.zeros(1, np.int64), np.zeros(1, dtype), self.value)
 
     def publish(self, values: np.ndarray | Mapping[str, object]) -> int:
@@ -356,7 +357,7 @@ class RequestWriter:
         else:
             if values.dtype != self.value.dtype or values.shape != (1,):
                 raise RecordError(f"request block: {values.dtype} of shape {values.shape} is not one of its values")
-            self.value[:] = values
+            self._bytes[:] = values.view(np.uint8)
         _publish(self.memory.counter, self.memory.slots, self.value)
         return int(self.memory.counter[0]) // 2
 

@@ -166,22 +166,28 @@ def _label(motion: MotionScore, motions: tuple[MotionScore, ...]) -> str:
 def backlash_table(score: BacklashScore) -> Table:
     """Identified against true, with standard deviations."""
     known = all(edge.true is not None for edge in score.edges)
-    columns = ["Joint", "identified", "± 1 sd"] + (["true", "off by", "off by (%)"] if known else [])
+    columns = ["Joint", "identified", "± 1 sd"] + (["true", "off by"] if known else [])
     rows: list[list[str | Quantity]] = []
     for edge in score.edges:
-        prefix = "µ" if edge.unit == "m" else "k"
+        is_length = edge.unit == "m"
+        unit, scale = ("m", 1.0) if is_length else ("N/mm", 1e-3)
+        prefix = "µ" if is_length else ""
         cells: list[str | Quantity] = [
             edge.name,
-            Quantity(edge.identified, edge.unit, 5, prefix),
-            Quantity(edge.sd, edge.unit, 2),
+            Quantity(scale * edge.identified, unit, 5, prefix),
+            Quantity(scale * edge.sd, unit, 2, prefix),
         ]
         if edge.true is not None:
             off = edge.identified - edge.true
-            cells += [Quantity(edge.true, edge.unit, 5, prefix), Quantity(off, edge.unit, 2)]
+            # A place has no share of anything; what has a size is judged by its share.
             is_place = edge.name.endswith("edge")
-            cells.append("" if is_place else Quantity(100.0 * off / edge.true, "%", 2))
+            shift = Quantity(off, unit, 2, prefix) if is_place else Quantity(100.0 * off / edge.true, "%", 2)
+            cells += [Quantity(scale * edge.true, unit, 5, prefix), shift]
         rows.append(cells)
-    note = "Edges on macro minus end, in the run's own zero; the joint carries no force between them."
+    note = (
+        "On macro minus end, in the run's own zero: no force from minus the left to plus the right edge. The standard "
+        "deviations hold noise only; a mass or force constant that is off in the profile shifts stiffness alike."
+    )
     return Table("Backlash", columns, rows, note)
 
 
@@ -288,12 +294,14 @@ def _backlash_pictures(run: Run, score: BacklashScore) -> list[Picture]:
     if balance is not None:
         caption = "Each point: what the joint must have carried, from the micro's mass times the measured "
         caption += "acceleration, less its motor's force and its spring. The line is not fitted to these points: it "
-        caption += "is what the estimator in the loop identified while the stage moved."
+        caption += (
+            "is what the estimator in the loop identified while the stage moved. The loop is the contact's damping."
+        )
         draw = Draw(report.backlash_figure, *balance, identified, true)
         made.append(Picture("backlash", "The joint, identified", caption, draw))
     estimates = _estimates(score)
     if estimates:
-        caption = "The estimator in the loop while the micro sweeps both edges."
+        caption = "The estimator in the loop while the micro sweeps both edges; its band holds noise, no error of the profile."
         made.append(Picture("convergence", "Identification", caption, Draw(report.convergence_figure, estimates)))
     return made
 
@@ -305,7 +313,7 @@ def _curve(score: BacklashScore, value, with_band: bool) -> BacklashCurve:
         "right_half_width_m": _NORMAL_95 * right.sd,
     }
     return BacklashCurve(
-        -value(left),
+        value(left),
         value(right),
         value(score.edge("left stiffness")),
         value(score.edge("right stiffness")),
@@ -346,7 +354,7 @@ def _estimates(score: BacklashScore) -> list[Estimate]:
     """Show edges and stiffness as they are identified; none where the run has no standard deviations by row."""
     rows = score.rows
     names = (
-        ("left edge", "backlash_left", "µm", -1e6),
+        ("left edge", "backlash_left", "µm", 1e6),
         ("right edge", "backlash_right", "µm", 1e6),
         ("left stiffness", "backlash_left_stiffness", "N/mm", 1e-3),
         ("right stiffness", "backlash_right_stiffness", "N/mm", 1e-3),
@@ -355,13 +363,13 @@ def _estimates(score: BacklashScore) -> list[Estimate]:
     for name, field, unit, scale in names:
         ending = "_n_per_m" if "stiffness" in field else "_m"
         value = rows[f"{field}{ending}"] * scale
-        half = _NORMAL_95 * rows[f"{field}_sd{ending}"] * abs(scale)
+        half = _NORMAL_95 * rows[f"{field}_sd{ending}"] * scale
         known = np.isfinite(half) & np.isfinite(value)
         if np.count_nonzero(known) < 2:
             return []
         value, half = np.where(known, value, np.nan), np.where(known, half, np.nan)
         true = score.edge(name).true
-        shown = true * abs(scale) if true is not None else None
+        shown = true * scale if true is not None else None
         estimates.append(Estimate(name, unit, score.t_s, value, half, shown))
     return estimates
 
@@ -373,5 +381,5 @@ def _timing_picture(score: CycleScore) -> Picture:
             TimeSeries("decode, tick and encode", score.tick_ns),
             TimeSeries("wake-up behind its instant", score.lateness_ns),
         ]
-    caption = "Every cycle with power on. What lies beyond the deadline is a missed cycle."
+    caption = "Every cycle with power on; the dashed line is one period."
     return Picture("timing", "Timing", caption, Draw(report.timing_figure, series, score.period_ns))

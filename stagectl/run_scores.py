@@ -3,6 +3,7 @@
 Motions are found by the events that the supervisor wrote; the demo, `run` and `runs plot` all score alike.
 """
 
+import itertools
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,9 @@ VALUE_SEAM = "plant"
 
 SETTLING_WINDOW_M = 100e-9
 SETTLING_DWELL_S = 0.2
+LEAD_IN_S = 0.2
+"""Rest before the first motion that is scored; what swings out before it belongs to the move that led there."""
+
 SWEEP_NAME = "identifying the backlash"
 _UNDER = re.compile(r"(?P<trajectory>.+) under (?P<law>\w+)")
 _JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
@@ -82,7 +86,7 @@ class BacklashScore:
     """An identification: the joint in the run's own zero, and the rows that it came from."""
 
     segment: Segment
-    edges: tuple[Edge, ...]  # left and right edge (-left, +right on macro minus end), width, both stiffnesses
+    edges: tuple[Edge, ...]  # left and right edge (no force from -left to +right), width, both stiffnesses
     rows: np.ndarray
     t_s: np.ndarray
 
@@ -178,6 +182,8 @@ def score_motion(run: Run, segment: Segment, truth: dict[str, np.ndarray] | None
     profile = Profile.model_validate(run.manifest["profile"])
     scored = _joined(run, truth, segment) if truth is not None else None
     rows = run.rows[segment.first_row : segment.first_row + segment.rows_count]
+    skipped = _lead_in(rows, profile.cycle.rate_hz)
+    rows = rows[skipped:]
     t_s = (rows["cycle"] - rows["cycle"][0]) / profile.cycle.rate_hz
     fresh = (rows["sequence"] == rows["cycle"]) & (rows["samples_new"] > 0)
     measured_m = np.where(fresh, rows["end_position_m"] - rows["setpoint_position_m"], np.nan)
@@ -185,7 +191,7 @@ def score_motion(run: Run, segment: Segment, truth: dict[str, np.ndarray] | None
     for name in SETPOINT.names or ():
         setpoints[name] = rows[f"setpoint_{name}"]
     rests = _rests(setpoints)
-    true_m = None if scored is None else scored.true_mean_error_m
+    true_m = None if scored is None else scored.true_mean_error_m[skipped:]
     judged_m, judged_t_s = (measured_m[fresh], t_s[fresh]) if true_m is None else (true_m, t_s)
     return MotionScore(
         segment=segment,
@@ -197,7 +203,7 @@ def score_motion(run: Run, segment: Segment, truth: dict[str, np.ndarray] | None
         measured=error_statistics(t_s[fresh], measured_m[fresh], setpoints[fresh]),
         settling=_worst_settling(judged_t_s, judged_m, t_s, rests),
         hold=_last_hold(t_s, rests),
-        contact_ratio=None if scored is None else float(np.mean(scored.contact_force_n != 0.0)),
+        contact_ratio=None if scored is None else float(np.mean(scored.contact_force_n[skipped:] != 0.0)),
         period_s=profile.cycle.period_s,
     )
 
@@ -224,6 +230,12 @@ def _joined(run: Run, truth: dict[str, np.ndarray], segment: Segment) -> Scored:
     )
 
 
+def _lead_in(rows: np.ndarray, rate_hz: float) -> int:
+    """Count the rows of rest before the first motion, less what counts as its lead-in."""
+    moving = np.flatnonzero(np.abs(rows["setpoint_velocity_m_per_s"]) > 0.0)
+    return max(int(moving[0]) - round(LEAD_IN_S * rate_hz), 0) if moving.size else 0
+
+
 def _rests(setpoints: np.ndarray) -> list[slice]:
     """Return the stretches in which the reference stands still behind a motion."""
     still = np.ones(setpoints.size, bool)
@@ -232,7 +244,7 @@ def _rests(setpoints: np.ndarray) -> list[slice]:
         still &= size <= 1e-6 * np.max(size)
     edges = np.flatnonzero(np.diff(still.astype(int)))
     bounds = [0, *(edges + 1), still.size]
-    stretches = [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True) if still[a]]
+    stretches = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds) if still[a]]
     return [stretch for stretch in stretches if stretch.start > 0]
 
 
@@ -286,9 +298,7 @@ def _edges(identified: dict[str, float], true: dict[str, float] | None) -> tuple
     both_known = "left_m" in known
     sides = ("left", "right")
     return (
-        Edge(
-            "left edge", "m", -identified["left_m"], identified["left_sd_m"], -known["left_m"] if both_known else None
-        ),
+        Edge("left edge", "m", identified["left_m"], identified["left_sd_m"], known.get("left_m")),
         Edge("right edge", "m", identified["right_m"], identified["right_sd_m"], known.get("right_m")),
         Edge(
             "width",

@@ -92,6 +92,8 @@ class Stop(IntEnum):
     COMMAND_LOST = 19
     MEASUREMENT_NOT_FINITE = 20
     LINK_LOST = 21
+    HEARTBEAT_LOST = 22
+    RECORD_LOST = 23
 
 
 STOP_TEXT = {
@@ -117,6 +119,8 @@ STOP_TEXT = {
     Stop.COMMAND_LOST: "commands could not be put on the bus",
     Stop.MEASUREMENT_NOT_FINITE: "a measured position is not a finite number",
     Stop.LINK_LOST: "the bus or the interferometer's port is gone, or speaks another layout",
+    Stop.HEARTBEAT_LOST: "a drive sends no heartbeat",
+    Stop.RECORD_LOST: "the run can't be written to its disk",
 }
 
 

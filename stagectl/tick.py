@@ -4,6 +4,7 @@ The same text serves the machine, the rig over the wire, batch simulation and ex
 from Python a cycle at a time, or from the compiled loop of `stagectl.batch`. Pure; knows no bus and no clock.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from stagectl import backlash, compose, estimator, guard
+from stagectl.compiled import direct
 from stagectl.laws import dsmc, pid
 from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT, new
 
@@ -76,7 +78,6 @@ def decide(m, now, later, e, ahead, after, l, q, p):
     a = ahead[0]
     f = after[0]
     x = e[0]
-    reference.extrapolate(later, now, x.actuation_delay_s)
     after[0] = ahead[0]
     law.middle(f, later, q[0], l[0], x.period_s)
     relative_m = f.middle_end_position_m - f.middle_macro_position_m
@@ -120,7 +121,10 @@ def tick(measurement, setpoint, later, command, e, model, ahead, after, l, g, b,
     c = command[0]
     x = e[0]
     estimate(m, e, model, ahead, b, q, p)
-    macro_n, micro_n = decide(m, now, later[0], e, ahead, after, l, q, p)
+    reference.extrapolate(later[0], now, x.actuation_delay_s)
+    macro_n, micro_n = 0.0, 0.0
+    if x.started != 0.0:  # before the first sample nothing is known: no force
+        macro_n, micro_n = decide(m, now, later[0], e, ahead, after, l, q, p)
     c.macro_force_asked_n = macro_n
     c.micro_force_asked_n = micro_n
     c.stop = guard.step(g[0], m, now, macro_n, micro_n)
@@ -176,12 +180,22 @@ class Controller:
     backlash: np.ndarray
     belief: np.ndarray
     effects: np.ndarray
+    compiled_tick: Callable[..., None] | None = None
 
-    STATES = ("later", "command", "estimator", "model", "ahead", "after", "law", "guard", "backlash", "belief", "effects")
+    STATES = (
+        *("later", "command", "estimator", "model", "ahead", "after"),
+        *("law", "guard", "backlash", "belief", "effects"),
+    )
 
     def step(self) -> None:
         """Run one cycle on `measurement` and `setpoint`; the outcome stands in `command` and the states."""
-        self.module.tick(
+        if self.compiled_tick is None:
+            self.compiled_tick = direct(
+                self.module.tick,
+                *(self.measurement, self.setpoint, self.later, self.command, self.estimator, self.model, self.ahead),
+                *(self.after, self.law, self.guard, self.backlash, self.belief, self.effects),
+            )
+        self.compiled_tick(
             self.measurement,
             self.setpoint,
             self.later,

@@ -52,7 +52,20 @@ def kind_of(trajectory: str, shape: Shape) -> str:
 
 
 def planned(profile: Profile, trajectory: str, shape: Shape) -> trajectories.Trajectory:
-    """Plan a trapezoid, a sine or a file's motion on the profile's cycle; `move` is planned where it begins."""
+    """Plan a trapezoid, a sine or a file's motion, and refuse before anything moves what the stage can't do."""
+    plan = _planned(profile, trajectory, shape)
+    macro = profile.macro
+    trajectories.check(
+        plan,
+        macro.travel_m,
+        macro.velocity_limit_m_per_s,
+        macro.acceleration_limit_m_per_s2,
+        stop_deceleration_m_per_s2=macro.stop_deceleration_m_per_s2,
+    )
+    return plan
+
+
+def _planned(profile: Profile, trajectory: str, shape: Shape) -> trajectories.Trajectory:
     kind = kind_of(trajectory, shape)
     low_m, high_m = profile.macro.travel_m
     middle_m, span_m = 0.5 * (low_m + high_m), high_m - low_m

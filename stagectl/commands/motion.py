@@ -1,0 +1,142 @@
+"""`stagectl run`, `identify`, `jog` and `home`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
+from stagectl.commands.opening import Place, ended, home_and_arm, law_name, opened, place
+from stagectl.commands.planning import Shape, kind_of, planned
+from stagectl.commands.scores_json import scores_json
+from stagectl.commands.tables import terminal
+from stagectl.errors import RequestError
+from stagectl.record import read_run
+from stagectl.run_page import scores_of, tables
+from stagectl.run_scores import read_truth
+from stagectl.runs import new_run_folder
+from stagectl.signals import STOP_TEXT, Stop
+from stagectl.supervisor import Outcome, Supervisor
+
+
+def run(
+    voice: Voice,
+    profile: str,
+    backend: str,
+    runs_root: Path,
+    seed: int,
+    trajectory: str,
+    shape: Shape,
+    law: str | None,
+) -> Answer:
+    """Home, follow one trajectory under one law."""
+    where = place(profile, backend, runs_root, seed)
+    law = law_name(law, where.profile)
+    kind = kind_of(trajectory, shape)
+    if kind == "move":
+        target_m = shape.target_m if shape.target_m is not None else 0.0
+        if where.is_value_seam:
+            raise RequestError("a move needs a stage that stands somewhere; take --backend rig, or another trajectory")
+        return _on_stage(where, voice, "move", law, lambda stage: stage.move(target_m, law))
+    plan = planned(where.profile, trajectory, shape)
+    if where.is_value_seam:
+        return _behind_value_seam(
+            where, voice, plan.name, lambda seam: seam.follow(plan.setpoints, f"{plan.name} under {law}", law)
+        )
+    return _on_stage(where, voice, plan.name, law, lambda stage: stage.run(plan, law))
+
+
+def identify(
+    voice: Voice, profile: str, backend: str, runs_root: Path, seed: int, frequency_hz: float, duration_s: float
+) -> Answer:
+    """Home, sweep the micro over both edges."""
+    where = place(profile, backend, runs_root, seed)
+    if where.profile.micro is None:
+        raise RequestError(f"profile {where.profile.name}: this stage has no micro; there is no backlash to identify")
+    if where.is_value_seam:
+        return _behind_value_seam(where, voice, "identify", lambda seam: seam.identify(frequency_hz, duration_s))
+    return _on_stage(where, voice, "identify", None, lambda stage: stage.identify(frequency_hz, duration_s))
+
+
+def jog(
+    voice: Voice, profile: str, backend: str, runs_root: Path, seed: int, distance_m: float, law: str | None
+) -> Answer:
+    """Home, move by a distance."""
+    where = _with_drives(place(profile, backend, runs_root, seed), "jog")
+    law = law_name(law, where.profile)
+
+    def by_distance(stage: Supervisor) -> Outcome:
+        return stage.move(float(stage.status()["setpoint_position_m"]) + distance_m, law)
+
+    return _on_stage(where, voice, "jog", law, by_distance)
+
+
+def home(voice: Voice, profile: str, backend: str, runs_root: Path, seed: int) -> Answer:
+    """Home only."""
+    where = _with_drives(place(profile, backend, runs_root, seed), "home")
+    return _on_stage(where, voice, "home", None, None)
+
+
+def _with_drives(where: Place, command: str) -> Place:
+    if where.is_value_seam:
+        raise RequestError(f"{command} needs drives and a sensor; the value seam has none: take --backend rig")
+    return where
+
+
+def _on_stage(
+    where: Place, voice: Voice, name: str, law: str | None, motion: Callable[[Supervisor], Outcome] | None
+) -> Answer:
+    """Connect, home, move, come to rest; score what was recorded."""
+    with opened(where, name, voice) as stage:
+        outcome = home_and_arm(stage, law) if motion is not None else stage.home()
+        if outcome.finished and motion is not None:
+            outcome = motion(stage)
+        position_m = float(stage.status()["end_position_m"])
+        folder = stage.folder
+    return _answer(voice, folder, outcome.stop, ended(outcome), {"end_position_m": position_m})
+
+
+class _ValueSeam:
+    """What a command may ask of a machine straight behind the law."""
+
+    def __init__(self, where: Place, folder: Path, voice: Voice):
+        from sim_backend.machine import load_machine
+
+        self._where, self._folder, self._voice = where, folder, voice
+        self._machine = load_machine(where.profile.name)
+
+    def follow(self, setpoints, name: str, law: str) -> Stop:
+        from stagectl.value_seam_run import simulate
+
+        where = self._where
+        return simulate(
+            where.profile, self._machine, setpoints, name, law, self._folder, where.seed, self._voice.progress
+        )
+
+    def identify(self, frequency_hz: float, duration_s: float) -> Stop:
+        from stagectl.value_seam_run import identify as sweep
+
+        where = self._where
+        return sweep(
+            where.profile, self._machine, frequency_hz, duration_s, self._folder, where.seed, self._voice.progress
+        )
+
+
+def _behind_value_seam(where: Place, voice: Voice, name: str, motion: Callable[[_ValueSeam], Stop]) -> Answer:
+    """Simulate, record and score."""
+    folder = new_run_folder(where.runs_root, name)
+    voice.run_folder = folder
+    stop = motion(_ValueSeam(where, folder, voice))
+    return _answer(voice, folder, stop, f"{name}: {STOP_TEXT[stop]}", {})
+
+
+def _answer(voice: Voice, folder: Path, stop: Stop, text: str, facts: dict) -> Answer:
+    """Say how it ended, with the scores of what was recorded."""
+    voice.progress("scoring", 0.0)
+    run = read_run(folder)
+    scores = scores_of(run, read_truth(folder))
+    voice.progress.done()
+    finished = stop is Stop.FINISHED
+    shown: list = [terminal(table) for table in tables(scores)]
+    shown.append(text if finished else f"[red]ended early[/]: {text}")
+    shown += [f"run     {folder}", f"[dim]figures: stagectl runs plot {folder}[/]"]
+    data = {"run": folder, "stop": stop.name, "finished": finished, "text": text, **facts, **scores_json(scores)}
+    return Answer(data, shown, 0 if finished else ENDED_EARLY)

@@ -1,0 +1,72 @@
+"""`stagectl profile check`, `show` and `list`."""
+
+from typing import Any
+
+from rich.table import Table
+from rich.tree import Tree
+
+from stagectl.commands.answer import Answer, Voice
+from stagectl.errors import ProfileError
+from stagectl.profile import Profile, list_profiles, load_profile
+from stagectl.units import unit_of
+
+
+def check(voice: Voice, profile: str) -> Answer:
+    """Load a profile; ProfileError says everything that is wrong with it."""
+    found = load_profile(profile)
+    load_ratio = found.worst_bus_load_ratio
+    shown = [
+        f"[green]✓[/] {found.name}: every key known, every number within its limits",
+        f"  axes {', '.join(found.axes)}; {found.cycle.rate_hz:g} Hz; law {found.control.law}; "
+        f"{len(found.effects)} effects; CAN at most {100.0 * load_ratio:.0f} % full",
+        f"  [dim]{found.source_path}[/]",
+    ]
+    data = {
+        "profile": found.name,
+        "path": found.source_path,
+        "sha256": found.sha256,
+        "axes": list(found.axes),
+        "worst_bus_load_ratio": load_ratio,
+    }
+    return Answer(data, shown)
+
+
+def show(voice: Voice, profile: str) -> Answer:
+    """Show a profile with its defaults filled in."""
+    found = load_profile(profile)
+    effective = found.effective()
+    tree = Tree(f"[bold]{found.name}[/]  [dim]{found.source_path}[/]")
+    _grow(tree, effective)
+    return Answer({"profile": effective, "path": found.source_path, "sha256": found.sha256}, [tree])
+
+
+def _grow(tree: Tree, values: dict[str, Any]) -> None:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            _grow(tree.add(f"[cyan]{key}[/]"), value)
+        elif isinstance(value, list | tuple) and value and all(isinstance(item, dict) for item in value):
+            for number, item in enumerate(value):
+                _grow(tree.add(f"[cyan]{key}[/] {item.get('name', number)}"), item)
+        else:
+            unit = unit_of(key)
+            shown = f"{value:.9g}" if isinstance(value, float) else str(value)
+            tree.add(f"{key} = {shown}" + (f" [dim]{unit}[/]" if unit not in (None, "1") else ""))
+
+
+def names(voice: Voice) -> Answer:
+    """List every profile that a bare name can mean, with what is wrong where something is."""
+    table = Table("name", "axes", "rate", "law", "file", box=None, pad_edge=False, header_style="bold")
+    data = []
+    for name in list_profiles():
+        try:
+            found: Profile | None = load_profile(name)
+            problem = ""
+        except ProfileError as error:
+            found, problem = None, str(error)
+        if found is None:
+            table.add_row(name, "", "", "", f"[red]{problem.splitlines()[0]}[/]")
+        else:
+            rate = f"{found.cycle.rate_hz:g} Hz"
+            table.add_row(name, " + ".join(found.axes), rate, found.control.law, str(found.source_path))
+        data.append({"name": name, "path": None if found is None else found.source_path, "problem": problem})
+    return Answer({"profiles": data}, [table])

@@ -1,0 +1,30 @@
+"""Shipped profiles and machines, read once."""
+
+import pytest
+
+from sim_backend.machine import load_machine
+from stagectl.profile import load_profile
+
+
+@pytest.fixture(scope="session")
+def oled_profile():
+    """What is believed of the default stage."""
+    return load_profile("oled-printer")
+
+
+@pytest.fixture(scope="session")
+def oled_machine():
+    """What the default stage is."""
+    return load_machine("oled-printer")
+
+
+@pytest.fixture(scope="session")
+def single_profile():
+    """What is believed of a stage with one axis."""
+    return load_profile("single-axis")
+
+
+@pytest.fixture(scope="session")
+def single_machine():
+    """What a stage with one axis is."""
+    return load_machine("single-axis")
