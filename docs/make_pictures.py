@@ -29,7 +29,7 @@ def main() -> int:
             driven = demo.drive(stage, demo.planned(profile), say=print)
             stage.disarm()
             truth = stage.backend.truth()
-        if not driven.stop.name == "FINISHED" or truth is None:
+        if driven.stop.name != "FINISHED" or truth is None:
             print(f"the demo ended early: {driven.outcomes[-1].text}")
             return 1
         write_truth(stage.folder, truth, load_machine(PROFILE).backlash)

@@ -21,8 +21,8 @@ import can
 import numpy as np
 
 from drivers.arming import DriveMapping
-from drivers.hub_socket import connect_hub
 from drivers.can_bus import ERROR_FLAG, open_network
+from drivers.hub_socket import connect_hub
 from drivers.transport import CHUNK_LIMIT_BYTES, error_frame_text, now_t_ns
 from drivers.wire import Inbox, WireDecoder, WireEncoder, frame_names
 from sim_backend.batch import BatchWire
@@ -31,15 +31,15 @@ from stagectl import estimator
 from stagectl.errors import DriveError, LinkError, ProfileError, RecordError, TimingError
 from stagectl.profile import Profile
 from stagectl.replay import describe_mapping
-from stagectl.requests import REQUEST, STATUS, Mode
+from stagectl.requests import REQUEST, RESTING, STATUS, Mode
 from stagectl.ring import RequestReader, RequestWriter, RingReader, RingWriter
-from stagectl.servo import Servo
+from stagectl.servo import RELEASE_CYCLES, Servo
 from stagectl.signals import SETPOINT
 from stagectl.tracker import Tracker
+from stagectl.undisturbed import undisturbed
 
 SEGMENT_ROWS = 300_000
 """Setpoints that the segment table holds: 5 minutes at 1 kHz."""
-
 
 
 @dataclass(slots=True)
@@ -55,6 +55,9 @@ class ServoLink:
     pass_time: Callable[[float], None]
     now_t_ns: Callable[[], int]
     close: Callable[[], None]
+    """Have the servo bring a moving stage to rest, take the power away and end."""
+    forget_rows: Callable[[], None]
+    """Give the ring up, once all its rows are on the disk."""
 
 
 class Backend(Protocol):
@@ -89,6 +92,9 @@ class Backend(Protocol):
         """Let go of the world."""
         ...
 
+
+_END_S = 20.0
+"""The longest that a stage takes to come to rest."""
 
 _SYNC_STEP_NS = 120_000
 _SYNC_PATIENCE_NS = 360_000  # two RPDOs and SYNC take 220 us; longer means that the bus does not carry it
@@ -200,8 +206,17 @@ class BatchBackend:
 
         def pass_time(duration_s: float) -> None:
             until_t_ns = self.wire.t_ns + round(duration_s * 1e9)
-            while self.wire.t_ns < until_t_ns:
+            with undisturbed():  # a cycle that Ctrl-C splits would lack its row
+                while self.wire.t_ns < until_t_ns:
+                    servo.cycle()
+
+        def end() -> None:
+            requests.publish({"mode": int(Mode.EXIT)})
+            until_t_ns = self.wire.t_ns + round(_END_S * 1e9)
+            leaving = 0
+            while self.wire.t_ns < until_t_ns and not (leaving > 1 and (servo.released or leaving > RELEASE_CYCLES)):
                 servo.cycle()
+                leaving += servo.phase in RESTING
 
         return ServoLink(
             requests=requests,
@@ -212,7 +227,8 @@ class BatchBackend:
             snapshot=snapshot,
             pass_time=pass_time,
             now_t_ns=lambda: self.wire.t_ns,
-            close=lambda: None,
+            close=end,
+            forget_rows=lambda: None,
         )
 
     def truth(self) -> dict[str, np.ndarray]:
@@ -320,7 +336,8 @@ class RealtimeBackend:
         """Give the servo its bus, port and memory; it cycles when this returns."""
         self.wait_warm()
         token = f"{os.getpid()}-{secrets.token_hex(4)}"
-        paths = {name: _SHARED_MEMORY / f"stagectl-{token}.{name}" for name in ("ring", "requests", "status", "segments")}
+        blocks = ("ring", "requests", "status", "segments")
+        paths = {name: _SHARED_MEMORY / f"stagectl-{token}.{name}" for name in blocks}
         self._paths = paths
         segments = np.memmap(paths["segments"], dtype=SETPOINT, mode="w+", shape=(SEGMENT_ROWS,))
         requests = RequestWriter(paths["requests"], REQUEST)
@@ -351,6 +368,7 @@ class RealtimeBackend:
             pass_time=self._pass_time,
             now_t_ns=now_t_ns,
             close=lambda: self._end_servo(requests),
+            forget_rows=lambda: paths["ring"].unlink(missing_ok=True),
         )
 
     def _pass_time(self, duration_s: float) -> None:
@@ -366,7 +384,7 @@ class RealtimeBackend:
         """Ask the servo to exit and wait for it."""
         requests.publish({"counter": 1 << 40, "mode": int(Mode.EXIT)})
         try:
-            self._servo.process.wait(10.0)
+            self._servo.process.wait(_END_S)
         except subprocess.TimeoutExpired:
             self._servo.stop()
 
@@ -395,15 +413,15 @@ class HardwareBackend(RealtimeBackend):
 class RigBackend(RealtimeBackend):
     """The software rig in a process of its own: the same bytes, in real time."""
 
-    def __init__(self, profile: Profile, machine: str | Path, *, seed: int = 0):
-        """Start the rig; servo and rig compile side by side."""
+    def __init__(self, profile: Profile, machine: str | Path, *, seed: int = 0, linger_s: float = 5.0):
+        """Start the rig; servo and rig compile side by side. It outlives a killed owner by `linger_s`."""
         self._folder = Path(tempfile.mkdtemp(prefix="stagectl-rig-"))
         channel, port = str(self._folder / "can.socket"), str(self._folder / "interferometer")
         super().__init__(profile, "rig", RIG_VENDOR_ID, "hub", channel, port)
         self.seed = seed
         self._truth_path = self._folder / "truth.npz"
         command = [sys.executable, "-m", "sim_backend", str(machine), "--socket", channel, "--pty-link", port]
-        command += ["--seed", str(seed), "--truth", str(self._truth_path), "--linger-s", "5"]
+        command += ["--seed", str(seed), "--truth", str(self._truth_path), "--linger-s", str(linger_s)]
         self._rig = _Child("rig", command)
         self._rig.hear(_WARM_TIMEOUT_S)
         self.description = f"software rig {Path(machine).stem}, real time, seed {seed}"

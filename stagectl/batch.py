@@ -23,6 +23,8 @@ DEVICES = np.dtype(
         ("interpolation_count", "f8"),  # parts of a count then
         ("macro_zero_m", "f8"),  # subtracted from what the sensor sees: the run's own zero
         ("end_zero_m", "f8"),
+        ("macro_origin_m", "f8"),  # where the sensor's counter reads zero
+        ("end_origin_m", "f8"),
         ("macro_amperes_per_word", "f8"),
         ("micro_amperes_per_word", "f8"),
         ("longest_substep_s", "f8"),
@@ -32,6 +34,7 @@ DEVICES = np.dtype(
         ("mean_from_s", "f8"),  # instant of the last sample, and the end's position integral there
         ("mean_from_m_s", "f8"),
         ("late_sample", "f8"),  # whose line comes a cycle late; -1 = none
+        ("late_t_s", "f8"),
         ("late_macro_m", "f8"),
         ("late_end_m", "f8"),
     ]
@@ -53,31 +56,31 @@ _INTERPOLATION_COUNT = 65536.0  # parts of a count: 16 bits of phase, the uMD2's
 
 _BATCH = '''
 @compiled
-def run(setpoints, noise_m, late, devices, state, parameters, machine_effects, measurement, setpoint, later, command,
-        e, model, ahead, after, l, g, b, q, p, measurements, commands, truth, backlashes):
+def run(setpoints, noise_m, late, instants_s, devices, state, parameters, machine_effects, measurement, setpoint,
+        later, command, e, model, ahead, after, l, g, b, q, p, measurements, commands, truth, backlashes):
     """Run a cycle a setpoint, or until a stop; returns the number of cycles done."""
     d = devices[0]
     s = state[0]
     m = measurement[0]
     c = command[0]
     for k in range(setpoints.size):
-        t_s = d.sample * d.period_s
+        t_s, latch_s = instants_s[k, 0], instants_s[k, 1]
         plant_module.advance(state, parameters, machine_effects, t_s, d.longest_substep_s, d.macro_a, d.micro_a, 1, 1)
         truth[k].t_s = t_s
-        truth[k].end_mean_m = s.end_position_m - d.end_zero_m
+        truth[k].end_mean_m = s.end_position_m - d.end_origin_m - d.end_zero_m
         if t_s > d.mean_from_s:
             area_m_s = s.end_position_integral_m_s - d.mean_from_m_s
-            truth[k].end_mean_m = area_m_s / (t_s - d.mean_from_s) - d.end_zero_m
+            truth[k].end_mean_m = area_m_s / (t_s - d.mean_from_s) - d.end_origin_m - d.end_zero_m
         d.mean_from_s = t_s
         d.mean_from_m_s = s.end_position_integral_m_s
-        truth[k].macro_position_m = s.macro_position_m - d.macro_zero_m
-        truth[k].end_position_m = s.end_position_m - d.end_zero_m
+        truth[k].macro_position_m = s.macro_position_m - d.macro_origin_m - d.macro_zero_m
+        truth[k].end_position_m = s.end_position_m - d.end_origin_m - d.end_zero_m
         truth[k].contact_force_n = s.contact_force_n
         m.cycle = int(d.sample)
-        m.t_ns = int((t_s + d.latch_delay_s) * 1e9)
+        m.t_ns = int(latch_s * 1e9)
         m.lease_left_ns = 1000000000
-        macro_m = s.macro_position_m + noise_m[k, 0]
-        end_m = s.end_position_m + noise_m[k, 1]
+        macro_m = s.macro_position_m + noise_m[k, 0] - d.macro_origin_m
+        end_m = s.end_position_m + noise_m[k, 1] - d.end_origin_m
         macro_step_m = d.macro_resolution_m
         if abs(s.macro_velocity_m_per_s) <= d.interpolation_speed_m_per_s:
             macro_step_m /= d.interpolation_count
@@ -89,13 +92,14 @@ def run(setpoints, noise_m, late, devices, state, parameters, machine_effects, m
         m.samples_new = 0
         if d.late_sample >= 0.0:  # the line of the sample before is here by now
             m.sequence = int(d.late_sample)
-            m.sample_t_ns = int(d.late_sample * d.period_s * 1e9)
+            m.sample_t_ns = int(d.late_t_s * 1e9)
             m.samples_new += 1
             m.macro_position_m = d.late_macro_m
             m.end_position_m = d.late_end_m
         d.late_sample = -1.0
         if late[k]:
             d.late_sample = d.sample
+            d.late_t_s = t_s
             d.late_macro_m = macro_m
             d.late_end_m = end_m
         else:
@@ -112,13 +116,12 @@ def run(setpoints, noise_m, late, devices, state, parameters, machine_effects, m
         backlashes[k, 1] = b[0].right_m
         backlashes[k, 2] = b[0].left_stiffness_n_per_m
         backlashes[k, 3] = b[0].right_stiffness_n_per_m
-        plant_module.advance(state, parameters, machine_effects, t_s + d.latch_delay_s, d.longest_substep_s,
+        plant_module.advance(state, parameters, machine_effects, latch_s, d.longest_substep_s,
                              d.macro_a, d.micro_a, 1, 1)
         d.macro_a = c.macro_word * d.macro_amperes_per_word
         d.micro_a = c.micro_word * d.micro_amperes_per_word
         d.sample += 1.0
-        next_s = d.sample * d.period_s
-        plant_module.advance(state, parameters, machine_effects, next_s, d.longest_substep_s,
+        plant_module.advance(state, parameters, machine_effects, instants_s[k + 1, 0], d.longest_substep_s,
                              d.macro_a, d.micro_a, 1, 1)
         if c.stop != 0:
             return k + 1
@@ -191,14 +194,29 @@ def simulation(controller: Controller, machine, *, latch_delay_s: float, seed: i
     )
 
 
-def run(simulation: Simulation, setpoints: np.ndarray, late: np.ndarray | None = None) -> Recording:
+def instants(simulation: Simulation, count: int) -> np.ndarray:
+    """Return the instants of the next `count` + 1 samples and of the SYNCs behind them, s, shape (count + 1, 2)."""
+    devices = simulation.devices
+    sample_s = (float(devices["sample"][0]) + np.arange(count + 1)) * float(devices["period_s"][0])
+    return np.column_stack([sample_s, sample_s + float(devices["latch_delay_s"][0])])
+
+
+def run(
+    simulation: Simulation,
+    setpoints: np.ndarray,
+    late: np.ndarray | None = None,
+    instants_s: np.ndarray | None = None,
+) -> Recording:
     """Run a cycle a setpoint (SETPOINT array) or until a stop, and return what was recorded.
 
     `late` (bool, one a cycle): where the sample's line comes after its cycle began, so that the next cycle has it.
+    `instants_s`: other instants than `instants`, where the jitter of a wire is to be felt.
     """
     count = setpoints.size
     if late is None:
         late = np.zeros(count, np.bool_)
+    if instants_s is None:
+        instants_s = instants(simulation, count)
     noise_m = simulation.noise.standard_normal((count, 2)) * simulation.noise_m
     measurements = np.zeros(count, MEASUREMENT)
     commands = np.zeros(count, COMMAND)
@@ -206,8 +224,8 @@ def run(simulation: Simulation, setpoints: np.ndarray, late: np.ndarray | None =
     estimates = np.zeros((count, 4))
     c = simulation.controller
     done = simulation.module.run(
-        setpoints, noise_m, late, simulation.devices, simulation.state, simulation.parameters, simulation.effects,
-        c.measurement, c.setpoint, c.later, c.command, c.estimator, c.model, c.ahead, c.after, c.law, c.guard,
-        c.backlash, c.belief, c.effects, measurements, commands, truth, estimates,
+        setpoints, noise_m, late, instants_s, simulation.devices, simulation.state, simulation.parameters,
+        simulation.effects, c.measurement, c.setpoint, c.later, c.command, c.estimator, c.model, c.ahead, c.after,
+        c.law, c.guard, c.backlash, c.belief, c.effects, measurements, commands, truth, estimates,
     )  # fmt: skip
     return Recording(measurements[:done], commands[:done], setpoints[:done], truth[:done], estimates[:done])

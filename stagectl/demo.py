@@ -11,7 +11,7 @@ from stagectl import trajectory as trajectories
 from stagectl.errors import RequestError
 from stagectl.profile import Profile
 from stagectl.requests import Phase
-from stagectl.signals import STOP_TEXT, Stop
+from stagectl.signals import Stop
 from stagectl.supervisor import Outcome, Supervisor
 
 LAWS = ("pid", "dsmc")
@@ -30,12 +30,17 @@ class Trip:
     """A motion that did not come to its own end, and was repeated."""
 
     motion: str
-    stop: Stop
+    outcome: Outcome
+
+    @property
+    def stop(self) -> Stop:
+        """Why it ended."""
+        return self.outcome.stop
 
     @property
     def text(self) -> str:
         """The sentence for the operator."""
-        return f"{self.motion}: {STOP_TEXT[self.stop]}"
+        return f"{self.motion}: {self.outcome.text}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +125,7 @@ class _Flow:
         """Move, once more where the guard ended it; tells whether the motion came to its own end."""
         outcome = self._attempt(name, motion)
         if not outcome.finished:
-            trip = Trip(name, outcome.stop)
+            trip = Trip(name, outcome)
             self.trips.append(trip)
             self._say(f"{trip.text}; acknowledging, arming again and repeating it once")
             self._stage.acknowledge()

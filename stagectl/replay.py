@@ -58,9 +58,9 @@ def describe_mapping(mapping: DriveMapping) -> dict[str, Any]:
 
 def mapping_of(table: Mapping[str, Any]) -> DriveMapping:
     """Make a mapping from the manifest's JSON."""
-    codecs = {name: Codec.from_mapping(table[name]) for name in ("rpdo", "tpdo", "inputs_tpdo")}
-    numbers = {name: int(table[name]) for name in ("node_id", "rpdo_id", "tpdo_id", "inputs_id", "emcy_id")}
-    return DriveMapping(**codecs, **numbers)
+    values: dict[str, Any] = {name: Codec.from_mapping(table[name]) for name in ("rpdo", "tpdo", "inputs_tpdo")}
+    values |= {name: int(table[name]) for name in ("node_id", "rpdo_id", "tpdo_id", "inputs_id", "emcy_id")}
+    return DriveMapping(**values)
 
 
 def replay(folder: str | Path) -> Comparison:

@@ -38,6 +38,9 @@ class Phase(IntEnum):
 TICKING = (Phase.TRACKING, Phase.STOPPING, Phase.GUIDED_STOP)
 """Phases in which the law runs every cycle."""
 
+RESTING = (Phase.IDLE, Phase.HOMED_DRIVE, Phase.STOPPED)
+"""Phases in which nothing is asked to move."""
+
 TEXT_BYTES_COUNT = 256
 
 REQUEST = np.dtype(
@@ -93,6 +96,7 @@ STATUS = np.dtype(
         ("inputs", "i8"),
         ("missed_cycles", "i8"),
         ("lost_samples", "i8"),
+        ("discarded_bytes", "i8"),  # sensor bytes that belong to no frame
         ("text", "u1", (TEXT_BYTES_COUNT,)),  # what a stop without numbers has to say, UTF-8
     ]
 )

@@ -58,6 +58,7 @@ _STATED = (
     "sensor_ready",
     "missed_cycles",
     "lost_samples",
+    "discarded_bytes",
     "macro_counts",
     "end_counts",
 )

@@ -153,6 +153,9 @@ def tracking_table(motions: tuple[MotionScore, ...]) -> Table:
     if touched:
         shares = ", ".join(f"{_label(one, motions)} {100.0 * (one.contact_ratio or 0.0):.2g} %" for one in touched)
         note += f" Time with the joint in contact: {shares}."
+    if any(motion.missed_cycles_count for motion in motions):
+        missed = ", ".join(f"{_label(one, motions)} {one.missed_cycles_count}" for one in motions)
+        note += f" Cycles that the host missed meanwhile: {missed}; each is an error that no law can help."
     names = sorted({motion.segment.trajectory for motion in motions})
     return Table(f"Tracking: {', '.join(names)}", columns, rows, note)
 
@@ -301,7 +304,8 @@ def _backlash_pictures(run: Run, score: BacklashScore) -> list[Picture]:
         made.append(Picture("backlash", "The joint, identified", caption, draw))
     estimates = _estimates(score)
     if estimates:
-        caption = "The estimator in the loop while the micro sweeps both edges; its band holds noise, no error of the profile."
+        caption = "The estimator in the loop while the micro sweeps both edges; "
+        caption += "its band holds noise, no error of the profile."
         made.append(Picture("convergence", "Identification", caption, Draw(report.convergence_figure, estimates)))
     return made
 
@@ -333,9 +337,13 @@ def _contact_points(run: Run, score: BacklashScore) -> tuple[np.ndarray, np.ndar
     grid = np.arange(rows["cycle"][0], rows["cycle"][-1] + 1)
     end_m = np.interp(grid, rows["cycle"][fresh], rows["end_position_m"][fresh])
     macro_m = np.interp(grid, rows["cycle"][fresh], rows["macro_position_m"][fresh])
-    acceleration = savgol_filter(end_m, window, 3, deriv=2, delta=period_s)
-    relative_m = savgol_filter(macro_m - end_m, window, 3)
-    rate = savgol_filter(macro_m - end_m, window, 3, deriv=1, delta=period_s)
+
+    def smooth(values: np.ndarray, derivative: int = 0) -> np.ndarray:
+        return np.asarray(savgol_filter(values, window, 3, deriv=derivative, delta=period_s))
+
+    acceleration = smooth(end_m, 2)
+    relative_m = smooth(macro_m - end_m)
+    rate = smooth(macro_m - end_m, 1)
     # The word of a row acts from its SYNC on, through the current loop.
     delay = profile.cycle.actuation_delay_s + micro.current_loop_s
     at = np.clip(np.floor(np.interp(grid - delay / period_s, rows["cycle"], np.arange(rows.size))), 0, rows.size - 1)
@@ -343,7 +351,7 @@ def _contact_points(run: Run, score: BacklashScore) -> tuple[np.ndarray, np.ndar
     share = 1.0 - (delay / period_s) % 1.0
     force_n = rows["micro_force_n"]
     motor_n = share * force_n[at.astype(int)] + (1.0 - share) * force_n[ahead.astype(int)]
-    motor_n = savgol_filter(motor_n, window, 3)
+    motor_n = smooth(motor_n)
     coupling_n = micro.spring_n_per_m * relative_m + micro.damping_n_s_per_m * rate
     contact_n = micro.mass_kg * acceleration - motor_n - coupling_n
     inner = slice(window, -window)

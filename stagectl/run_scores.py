@@ -67,6 +67,7 @@ class MotionScore:
     settling: Settling | None  # of the worst rest; None where the reference never rests long enough
     hold: slice  # rows of the last rest
     contact_ratio: float | None  # share of rows with the joint in contact
+    missed_cycles_count: int  # that the host was late for, while it moved
     period_s: float
 
 
@@ -154,8 +155,9 @@ def segments(run: Run) -> list[Segment]:
             continue
         match = _UNDER.fullmatch(name)
         trajectory, law = (match["trajectory"], match["law"]) if match else ("", "")
-        # Rows behind the last setpoint only hold; the rest that belongs to a trajectory is in its own setpoints.
-        count = min(int(begin["setpoints"]), of_it.size)
+        # Rows behind the last setpoint only hold; a missed cycle has no row, and the reference goes on by cycles.
+        cycles = rows["cycle"][of_it] - rows["cycle"][of_it[0]]
+        count = int(np.count_nonzero(cycles < int(begin["setpoints"])))
         found.append(Segment(name, trajectory, law, int(of_it[0]), count, Stop[end] if end else Stop.OPERATOR))
     return found
 
@@ -204,6 +206,7 @@ def score_motion(run: Run, segment: Segment, truth: dict[str, np.ndarray] | None
         settling=_worst_settling(judged_t_s, judged_m, t_s, rests),
         hold=_last_hold(t_s, rests),
         contact_ratio=None if scored is None else float(np.mean(scored.contact_force_n[skipped:] != 0.0)),
+        missed_cycles_count=int(rows["cycles_missed"][-1] - rows["cycles_missed"][0]),
         period_s=profile.cycle.period_s,
     )
 

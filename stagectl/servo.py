@@ -13,33 +13,49 @@ import numpy as np
 
 from drivers import cia402
 from drivers.wire import HEARTBEAT_FRAME, SYNC_FRAME, Inbox, WireDecoder, WireEncoder
-from stagectl.errors import LinkError
+from stagectl.guard import NEGATIVE_LIMIT, POSITIVE_LIMIT, PRESSURE_LOW, SAFE_TORQUE_OFF
 from stagectl.laws.reference import gap_centre
 from stagectl.requests import REQUEST, STATUS, TEXT_BYTES_COUNT, TICKING, Mode, Phase
 from stagectl.ring import RequestReader, RequestWriter, RingWriter
 from stagectl.row import FRAME_BYTES_COUNT, ROW, new_rows
 from stagectl.row_fill import fill_row, fill_status
 from stagectl.signals import COMMAND, SETPOINT, Stop
-from stagectl.tracker import Tracker, belief_of
+from stagectl.stop_text import emergency_detail, stop_detail
+from stagectl.tracker import LAW_NAMES, Tracker, belief_of
 
 _ENABLE_TIMEOUT_S = 2.0
 _QUICK_STOP_TIMEOUT_S = 5.0
 _HEARTBEATS_PER_TIMEOUT = 4
 _REST_M_PER_S = 1e-3
-_STATUS_ENABLED = 0x0027
+_REST_WINDOW_NS = 50_000_000
+_INTERLOCKS = SAFE_TORQUE_OFF | PRESSURE_LOW
+_LIMIT_SWITCHES = NEGATIVE_LIMIT | POSITIVE_LIMIT
 _READY_SAMPLES = 200  # before the sample clock counts as locked: 60 us / 200 = 0.3 us
 
 _GUIDED_STOPS = (
-    Stop.OPERATOR,
     Stop.TRAVEL,
     Stop.VELOCITY,
     Stop.FOLLOWING_ERROR,
     Stop.OVERRUN,
     Stop.THERMAL,
     Stop.LEASE,
-    Stop.SUPERVISOR_SILENT,
+    Stop.DRIVE_FAULT,
+    Stop.DIGITAL_INPUT,
+    Stop.EMERGENCY,
+    Stop.LINK_SILENT,
 )
-"""Stops after which sensor, drives and law can be trusted with the micro until the macro is slow."""
+"""Stops after which sensor and law can be trusted with the micro until the macro is slow, where its drive can."""
+
+_FULL_RAMP_STOPS = (Stop.LEASE, Stop.SUPERVISOR_SILENT)
+"""Nobody is left who knows where the stage may go: stop as short as the drive would."""
+
+_UNPOWERED_STOPS = (Stop.OPERATOR, Stop.FINISHED)
+"""After these the power goes; after all others the drives hold what they hold until somebody acknowledges."""
+
+_POWERED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia402.State.FAULT_REACTION_ACTIVE)
+
+RELEASE_CYCLES = 100
+"""What a drive has for showing that it is without power, before a servo that was asked to leaves."""
 
 _LENGTHS = tuple(count.to_bytes(8, "little") for count in range(FRAME_BYTES_COUNT + 1))
 
@@ -102,7 +118,8 @@ class Servo:
         trip = profile.trip
         self._silence_ns = int(trip.supervisor_silence_s * 1e9)
         self._heartbeat_every = max(1, int(trip.heartbeat_s / _HEARTBEATS_PER_TIMEOUT * profile.cycle.rate_hz))
-        self._stop_deceleration = 0.5 * profile.macro.stop_deceleration_m_per_s2
+        self._stop_deceleration = profile.macro.stop_deceleration_m_per_s2
+        self._node_ids = {axis: profile.axis(axis).node_id for axis in profile.axes}
         self.phase = Phase.IDLE
         self.stop = Stop.NONE
         self.text = ""
@@ -117,11 +134,13 @@ class Servo:
         self._counter_t_ns = 0
         self._rows = 0
         self._valid_samples = 0
+        self._newest_sequence = -1
         self._missed = 0
         self._command_lost = 0
         self._last_cycle = -1
         self._deadline_t_ns = 0
-        self._reset_edge = False
+        self._rest_mark_t_ns = 0
+        self._rest_mark_m = 0.0
 
     @property
     def mode(self) -> Mode:
@@ -132,6 +151,13 @@ class Servo:
     def supervisor_silence_s(self) -> float:
         """Time since the supervisor's counter changed."""
         return (self.inbox.t_ns - self._counter_t_ns) * 1e-9
+
+    @property
+    def released(self) -> bool:
+        """Whether both drives have shown that they are without power."""
+        m = self.tracker.measurement
+        words = [int(m[f"{axis}_statusword"][0]) for axis in self._node_ids]
+        return not any(cia402.state_of(word) in _POWERED for word in words)
 
     # ---- one cycle ---------------------------------------------------------------------------------------------
 
@@ -147,6 +173,9 @@ class Servo:
         started_ns = self._clock_ns()
         self._decode(t_ns)
         self._valid_samples += int(m["samples_new"][0])
+        if int(m["sequence"][0]) < self._newest_sequence:  # it restarted: its clock has to be found again
+            self._valid_samples = 0
+        self._newest_sequence = int(m["sequence"][0])
         self._read_request(t_ns)
         m["command_lost"][0] = self._command_lost
         m["overrun_ns"][0] = lateness_ns if lateness_ns > self._period_ns else 0
@@ -162,9 +191,13 @@ class Servo:
             command[...] = np.zeros(1, COMMAND)
             command["macro_target_m"] = m["macro_encoder_m"]
             stop = Stop.NONE
+        guided = False
+        target_m = float(command["macro_target_m"][0])
         if stop is not Stop.NONE:
+            guided = self._can_guide(stop)
             macro_target = cia402.State.QUICK_STOP_ACTIVE
-            if self.phase is Phase.GUIDED_STOP or stop not in _GUIDED_STOPS:
+            target_m = float(m["macro_encoder_m"][0])  # a stopped law's own may be nan
+            if not guided:
                 micro_target = cia402.State.QUICK_STOP_ACTIVE
         macro_word = self._controlword(int(m["macro_statusword"][0]), macro_target)
         micro_word = self._controlword(int(m["micro_statusword"][0]), micro_target)
@@ -174,9 +207,7 @@ class Servo:
         micro_frame = self.encoder.micro(micro_word, int(command["micro_word"][0]))
         if micro_frame is not None:
             frames.append(micro_frame)
-        macro_frame = self.encoder.macro(
-            macro_word, int(command["macro_word"][0]), float(command["macro_target_m"][0])
-        )
+        macro_frame = self.encoder.macro(macro_word, int(command["macro_word"][0]), target_m)
         frames += [macro_frame, SYNC_FRAME]
         if self._rows % self._heartbeat_every == 0:
             frames.append(HEARTBEAT_FRAME)
@@ -186,35 +217,48 @@ class Servo:
         inbox.sync_t_ns = sync_end_t_ns  # what the next cycle's TPDOs were sampled at
         self._record(lateness_ns, tick_ns, sync_end_t_ns, macro_word, micro_word, macro_frame[1], micro_frame)
         if stop is not Stop.NONE:
-            self._brake(stop, t_ns)
+            self._brake(stop, guided, t_ns)
         self._publish()
         self._plan_next(t_ns)
 
     def _decode(self, t_ns: int) -> None:
-        """Decode the inbox; bytes that can't be what was agreed end the run, and nothing of them is used."""
-        m = self.tracker.measurement
-        text = self.transport.failure
-        try:
-            self.decoder.decode(self.inbox, m)
-        except LinkError as error:
-            m["samples_new"][0] = 0
-            m["tpdos_new"][0] = 0
-            m["t_ns"][0] = t_ns
-            text = text or str(error)
-        if text and not self.text:
-            self.text = text
-            if self.phase in (Phase.IDLE, Phase.HOMED_DRIVE, Phase.ENABLING):
-                self._end(Stop.LINK_LOST, Phase.STOPPED, t_ns)
-            elif self.phase is not Phase.STOPPED:
-                self._end(Stop.LINK_LOST, Phase.QUICK_STOP, t_ns)
+        """Decode the inbox; bytes that can't be what was agreed, or none for good, end the run."""
+        text = self.decoder.decode(self.inbox, self.tracker.measurement)
+        text = self.transport.failure or text
+        if text and self.phase in (Phase.IDLE, Phase.HOMED_DRIVE, Phase.ENABLING):
+            self._end(Stop.LINK_LOST, Phase.STOPPED, t_ns, text)
+        elif text and self.phase not in (Phase.STOPPED, Phase.QUICK_STOP):
+            self._end(Stop.LINK_LOST, Phase.QUICK_STOP, t_ns, text)
 
-    def _brake(self, stop: Stop, t_ns: int) -> None:
-        """Leave the law: the macro by its drive; the micro still guided where sensor and drives can be trusted."""
-        if self.phase is Phase.GUIDED_STOP or stop not in _GUIDED_STOPS or not self._has_micro:
-            self._end(stop, Phase.QUICK_STOP, t_ns)
-            return
-        self.tracker.guide()
-        self._end(stop, Phase.GUIDED_STOP, t_ns)
+    def _can_guide(self, stop: Stop) -> bool:
+        """Tell whether the micro can be kept off its stops: sensor and law are sound, and its own drive obeys."""
+        if not self._has_micro or self.phase is Phase.GUIDED_STOP or stop not in _GUIDED_STOPS:
+            return False
+        m = self.tracker.measurement
+        obeys = cia402.state_of(int(m["micro_statusword"][0])) is cia402.State.OPERATION_ENABLED
+        tripped = int(m["micro_digital_inputs"][0]) & (_INTERLOCKS | _LIMIT_SWITCHES)
+        failed = int(m["emergency"][0]) >> 16 == self._node_ids["micro"]
+        silent = self.tracker.active.guard["micro_silence"][0] > 0.0
+        return obeys and not tripped and not failed and not (silent and stop is Stop.LINK_SILENT)
+
+    def _brake(self, stop: Stop, guided: bool, t_ns: int) -> None:
+        """Leave the law: the macro by its drive; the micro still guided where it can be."""
+        text = self._detail(stop)
+        if guided:
+            self.tracker.guide()
+            self._end(stop, Phase.GUIDED_STOP, t_ns, text)
+        else:
+            self._end(stop, Phase.QUICK_STOP, t_ns, text)
+
+    def _detail(self, stop: Stop) -> str:
+        """Say in numbers why a tick ended the run."""
+        if stop is Stop.REFERENCE_LOST:
+            return self.decoder.reference_text
+        if stop is Stop.COMMAND_LOST:
+            return f"{self.transport.lost_count} frames were refused so far; look for what else loads the bus"
+        one = self.tracker.active
+        parts = (one.measurement[0], one.setpoint[0], one.command[0], one.guard[0])
+        return stop_detail(stop, *parts, self._node_ids, LAW_NAMES[self.tracker.law_number])
 
     def _plan_next(self, t_ns: int) -> None:
         """Set the start of the next cycle: the sensor's next sample plus the phase, else a free-running period."""
@@ -237,9 +281,12 @@ class Servo:
         counter = int(request["counter"][0])
         if counter != self._counter:
             self._counter, self._counter_t_ns = counter, t_ns
+        if self.phase is not Phase.STOPPED:  # only a stop that is there can be acknowledged
+            self._acknowledged = int(request["acknowledge_number"][0])
         number = int(request["update_number"][0])
         if number != self._update_number:
-            shifts = self.decoder.set_zeros(float(request["macro_zero_counts"][0]), float(request["end_zero_counts"][0]))
+            zeros = float(request["macro_zero_counts"][0]), float(request["end_zero_counts"][0])
+            shifts = self.decoder.set_zeros(*zeros)
             self.tracker.measurement["macro_position_m"] += shifts[0]
             self.tracker.measurement["end_position_m"] += shifts[1]
             self.tracker.update(belief_of(request), *shifts)
@@ -250,11 +297,26 @@ class Servo:
         self.phase = phase
         self._phase_since_t_ns = t_ns
 
-    def _end(self, stop: Stop, phase: Phase, t_ns: int) -> None:
+    def _end(self, stop: Stop, phase: Phase, t_ns: int, text: str = "") -> None:
         """Latch why the run ended (the first reason stays) and go to the phase that brings the stage to rest."""
         if self.stop is Stop.NONE:
-            self.stop = stop
+            self.stop, self.text = stop, text
+        elif phase is Phase.QUICK_STOP and text and text not in self.text:
+            self.text = f"{self.text}; then {text}"
+        self._rest_mark_t_ns, self._rest_mark_m = t_ns, float("nan")
         self._enter(phase, t_ns)
+
+    def _refusal(self, mode: Mode) -> tuple[Stop, str]:
+        """Return why the drives must not be powered now, (NONE, "") when they may."""
+        m = self.tracker.measurement
+        if m["emergency"][0] != 0:
+            return Stop.EMERGENCY, emergency_detail(int(m["emergency"][0]))
+        inputs = int(m["macro_digital_inputs"][0]) | int(m["micro_digital_inputs"][0])
+        if inputs & (_INTERLOCKS if mode is Mode.HOME_DRIVE else _INTERLOCKS | _LIMIT_SWITCHES):
+            return Stop.DIGITAL_INPUT, self._detail(Stop.DIGITAL_INPUT)
+        if mode is Mode.TRACK and m["reference_lost"][0] != 0:
+            return Stop.REFERENCE_LOST, self.decoder.reference_text
+        return Stop.NONE, ""
 
     def _advance_phase(self, t_ns: int) -> tuple[cia402.State, cia402.State]:
         """Move between phases; returns the drive states wanted of macro and micro."""
@@ -265,10 +327,13 @@ class Servo:
         macro_state = cia402.state_of(int(m["macro_statusword"][0]))
         silent = t_ns - self._counter_t_ns > self._silence_ns
         if self.phase in (Phase.IDLE, Phase.HOMED_DRIVE):
-            if mode is Mode.HOME_DRIVE and self.phase is Phase.IDLE and not silent:
-                self._enter(Phase.HOMING_DRIVE, t_ns)
-            elif mode is Mode.TRACK and not silent:
-                self._enter(Phase.ENABLING, t_ns)
+            wanted = mode is Mode.TRACK or (mode is Mode.HOME_DRIVE and self.phase is Phase.IDLE)
+            if wanted and not silent:
+                stop, text = self._refusal(mode)
+                if stop is not Stop.NONE:
+                    self._end(stop, Phase.STOPPED, t_ns, text)
+                else:
+                    self._enter(Phase.ENABLING if mode is Mode.TRACK else Phase.HOMING_DRIVE, t_ns)
             elif mode is Mode.IDLE:
                 self._enter(Phase.IDLE, t_ns)
             return off, off
@@ -278,32 +343,47 @@ class Servo:
             if silent or mode is not Mode.TRACK:
                 self._end(Stop.SUPERVISOR_SILENT if silent else Stop.OPERATOR, Phase.STOPPED, t_ns)
                 return off, off
+            stop, text = self._refusal(mode)
+            if stop is not Stop.NONE:
+                self._end(stop, Phase.STOPPED, t_ns, text)
+                return off, off
             micro_on = not self._has_micro or cia402.state_of(int(m["micro_statusword"][0])) is on
             if macro_state is on and micro_on and m["samples_new"][0] > 0:
                 self.tracker.begin(int(self._request["law_number"][0]))
                 self._last_cycle = int(m["cycle"][0])
+                self._segment_row = self._segment_rows  # a segment that a stop cut short is never taken up again
                 self._enter(Phase.TRACKING, t_ns)
-            elif in_phase_s > _ENABLE_TIMEOUT_S:
-                self._end(Stop.DRIVE_FAULT, Phase.STOPPED, t_ns)
+            elif in_phase_s > _ENABLE_TIMEOUT_S or self._failed_drive():
+                stop, text = self._not_enabled()
+                self._end(stop, Phase.STOPPED, t_ns, text)
+                return off, off
             return on, on
         if self.phase is Phase.TRACKING:
             if silent:
-                self._end(Stop.SUPERVISOR_SILENT, Phase.STOPPING, t_ns)
+                silence_s = (t_ns - self._counter_t_ns) * 1e-9
+                text = f"no sign of life for {silence_s:.3f} s, limit {self._silence_ns * 1e-9:g} s"
+                self._end(Stop.SUPERVISOR_SILENT, Phase.STOPPING, t_ns, text)
             elif mode is not Mode.TRACK:
-                self._end(Stop.OPERATOR, Phase.STOPPING, t_ns)
+                self._end(Stop(int(self._request["stop"][0])) or Stop.OPERATOR, Phase.STOPPING, t_ns)
             elif m["lease_left_ns"][0] <= 0:
-                self._end(Stop.LEASE, Phase.STOPPING, t_ns)
+                text = f"it ended {-int(m['lease_left_ns'][0]) * 1e-6:.1f} ms ago; renew it as long as the stage moves"
+                self._end(Stop.LEASE, Phase.STOPPING, t_ns, text)
+            if self.phase is Phase.STOPPING:
+                m["lease_left_ns"][0] = max(int(m["lease_left_ns"][0]), self._period_ns)
             return on, on
         if self.phase is Phase.STOPPING:
             m["lease_left_ns"][0] = max(int(m["lease_left_ns"][0]), self._period_ns)  # coming to rest needs no lease
             if self.tracker.hold["velocity_m_per_s"][0] == 0.0 and in_phase_s > 0.3:
                 self._enter(Phase.STOPPED, t_ns)
-                return off, off
+                return self._stopped_targets(mode)
             return on, on
         if self.phase is Phase.GUIDED_STOP:
-            return self._guided(t_ns, in_phase_s, macro_state)
+            return self._guided(t_ns, in_phase_s)
         if self.phase is Phase.QUICK_STOP:
-            if in_phase_s > _QUICK_STOP_TIMEOUT_S:
+            if self._stands(t_ns):
+                self._enter(Phase.STOPPED, t_ns)
+            elif in_phase_s > _QUICK_STOP_TIMEOUT_S:
+                self.text += f"; the macro was not seen to stand within {_QUICK_STOP_TIMEOUT_S:g} s: keep clear of it"
                 self._enter(Phase.STOPPED, t_ns)
             return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
         # STOPPED: hold what the drives hold until the fault is acknowledged
@@ -311,23 +391,48 @@ class Servo:
         if number != self._acknowledged and mode in (Mode.RESET, Mode.IDLE):
             self._acknowledged = number
             self.stop = Stop.NONE
-            self.text = self.transport.failure
+            self.text = ""
             m["emergency"][0] = 0
             self._enter(Phase.IDLE, t_ns)
-        if self.stop in (Stop.OPERATOR, Stop.FINISHED):
             return off, off
+        return self._stopped_targets(mode)
+
+    def _stopped_targets(self, mode: Mode) -> tuple[cia402.State, cia402.State]:
+        """Return the drive states of a stage at rest: without power where that was asked for, else held."""
+        if mode is Mode.EXIT or self.stop in _UNPOWERED_STOPS:
+            return cia402.State.SWITCH_ON_DISABLED, cia402.State.SWITCH_ON_DISABLED
         return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
 
-    def _guided(
-        self, t_ns: int, in_phase_s: float, macro_state: cia402.State
-    ) -> tuple[cia402.State, cia402.State]:
+    def _failed_drive(self) -> bool:
+        """Tell whether a drive is in FAULT, which only an acknowledgement ends."""
+        m = self.tracker.measurement
+        words = [int(m[f"{axis}_statusword"][0]) for axis in self._node_ids]
+        return any(cia402.state_of(word) is cia402.State.FAULT for word in words)
+
+    def _not_enabled(self) -> tuple[Stop, str]:
+        """Say why the drives did not come up in time."""
+        m = self.tracker.measurement
+        words = [int(m[f"{axis}_statusword"][0]) for axis in self._node_ids]
+        if all(cia402.state_of(word) is cia402.State.OPERATION_ENABLED for word in words):
+            text = f"the drives are up, but no valid sample came within {_ENABLE_TIMEOUT_S:g} s; check beams and cable"
+            return Stop.SENSOR_AGE, text
+        return Stop.DRIVE_FAULT, self._detail(Stop.DRIVE_FAULT)
+
+    def _stands(self, t_ns: int) -> bool:
+        """Tell whether the macro's own encoder has been still for a while."""
+        m = self.tracker.measurement
+        if not m["tpdos_new"][0] & 1 or t_ns - self._rest_mark_t_ns < _REST_WINDOW_NS:
+            return False
+        encoder_m, since_s = float(m["macro_encoder_m"][0]), (t_ns - self._rest_mark_t_ns) * 1e-9
+        moved_m = abs(encoder_m - self._rest_mark_m)
+        self._rest_mark_t_ns, self._rest_mark_m = t_ns, encoder_m
+        return moved_m <= _REST_M_PER_S * since_s
+
+    def _guided(self, t_ns: int, in_phase_s: float) -> tuple[cia402.State, cia402.State]:
         """Keep the micro on the braking macro until that is slow, or until the sensor falls silent."""
-        one, m = self.tracker.active, self.tracker.measurement
-        m["lease_left_ns"][0] = max(int(m["lease_left_ns"][0]), self._period_ns)  # coming to rest needs no lease
-        if macro_state is cia402.State.QUICK_STOP_ACTIVE:
-            m["macro_statusword"][0] = _STATUS_ENABLED  # it brakes as asked: no drive fault for the guard
-        slow = abs(float(one.model["macro_velocity_m_per_s"][0])) < _REST_M_PER_S
-        if slow and in_phase_s > 0.1 or in_phase_s > _QUICK_STOP_TIMEOUT_S:
+        slow = abs(float(self.tracker.active.model["macro_velocity_m_per_s"][0])) < _REST_M_PER_S
+        if (slow and in_phase_s > 0.1) or in_phase_s > _QUICK_STOP_TIMEOUT_S:
+            self._rest_mark_t_ns, self._rest_mark_m = t_ns, float("nan")
             self._enter(Phase.QUICK_STOP, t_ns)
             return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
         return cia402.State.QUICK_STOP_ACTIVE, cia402.State.OPERATION_ENABLED
@@ -337,10 +442,15 @@ class Servo:
         off, on = cia402.State.SWITCH_ON_DISABLED, cia402.State.OPERATION_ENABLED
         m = self.tracker.measurement
         if silent or mode is not Mode.HOME_DRIVE or m["lease_left_ns"][0] <= 0:
-            self._end(Stop.SUPERVISOR_SILENT if silent else Stop.OPERATOR, Phase.QUICK_STOP, t_ns)
+            given_up = Stop.OPERATOR if mode is not Mode.HOME_DRIVE else Stop.LEASE
+            self._end(Stop.SUPERVISOR_SILENT if silent else given_up, Phase.QUICK_STOP, t_ns)
             return cia402.State.QUICK_STOP_ACTIVE, off
-        if m["emergency"][0] != 0 or state in (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE):
-            self._end(Stop.EMERGENCY if m["emergency"][0] else Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns)
+        stop, text = self._refusal(mode)
+        if stop is not Stop.NONE:
+            self._end(stop, Phase.QUICK_STOP, t_ns, text)
+            return cia402.State.QUICK_STOP_ACTIVE, off
+        if state in (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE):
+            self._end(Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns, self._detail(Stop.DRIVE_FAULT))
             return cia402.State.QUICK_STOP_ACTIVE, off
         if state is on and (t_ns - self._phase_since_t_ns) * 1e-9 > 0.05:
             progress = cia402.homing_of(int(m["macro_statusword"][0]))
@@ -348,7 +458,8 @@ class Servo:
                 self._enter(Phase.HOMED_DRIVE, t_ns)
                 return off, off
             if progress in (cia402.Homing.ERROR, cia402.Homing.ERROR_MOVING):
-                self._end(Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns)
+                text = "the macro's drive gave its homing up; check index, limit switches and macro.homing"
+                self._end(Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns, text)
                 return cia402.State.QUICK_STOP_ACTIVE, off
         return on, off
 
@@ -356,8 +467,7 @@ class Servo:
         """Return the next controlword; a fault is reset only on request, on a rising edge."""
         state = cia402.state_of(statusword)
         if state is cia402.State.FAULT and self._request["mode"][0] == Mode.RESET:
-            self._reset_edge = not self._reset_edge
-            return cia402.FAULT_RESET if self._reset_edge else 0
+            return cia402.FAULT_RESET if self._rows & 1 else 0
         return cia402.controlword(state, target)
 
     # ---- setpoints ---------------------------------------------------------------------------------------------
@@ -409,7 +519,8 @@ class Servo:
         hold = self.tracker.hold
         dt_s = passed * self._period_s
         v = float(hold["velocity_m_per_s"][0])
-        step = self._stop_deceleration * dt_s
+        share = 1.0 if self.stop in _FULL_RAMP_STOPS else 0.5
+        step = share * self._stop_deceleration * dt_s
         after = v - step if v > step else v + step if v < -step else 0.0
         hold["position_m"] += 0.5 * (v + after) * dt_s
         hold["velocity_m_per_s"] = after
@@ -471,7 +582,7 @@ class Servo:
             self._status, one.measurement, self.tracker.setpoint, self.tracker.hold, one.backlash,
             self._rows, int(self.phase), int(self.stop), self._segment_number,
             self._segment_rows - self._segment_row, self._update_number, int(ready), self._missed,
-            decoder.samples_lost, decoder.macro_counts, decoder.end_counts,
+            decoder.samples_lost, decoder.framer.counters.bytes_discarded, decoder.macro_counts, decoder.end_counts,
         )  # fmt: skip
         if self.text != self._stated_text:
             self._stated_text = self.text

@@ -27,11 +27,11 @@ from stagectl.errors import StagectlError
 from stagectl.profile import Profile, profile_from_effective
 from stagectl.record import recover
 from stagectl.replay import mapping_of
-from stagectl.requests import REQUEST, STATUS, Mode, Phase
+from stagectl.requests import REQUEST, RESTING, STATUS, Mode
 from stagectl.ring import RequestReader, RequestWriter, RingWriter
 from stagectl.row import new_rows
 from stagectl.row_fill import fill_row, fill_status
-from stagectl.servo import Servo
+from stagectl.servo import RELEASE_CYCLES, Servo
 from stagectl.signals import SETPOINT
 from stagectl.tracker import Tracker
 
@@ -109,7 +109,7 @@ def _warm(profile: Profile) -> None:
         )  # fmt: skip
     fill_status(
         status, one.measurement, tracker.setpoint, tracker.hold, one.backlash,
-        0, 0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0,
+        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0,
     )  # fmt: skip
     tracker.begin(0)
     tracker.guide()
@@ -173,21 +173,24 @@ def _serve(profile: Profile, config: dict[str, Any]) -> int:
     ring.close()
     status.close()
     if orphaned:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        recover(ring_path, Path(config["run_folder"]))
         for key in ("requests", "status", "segments"):
             Path(config[key]).unlink(missing_ok=True)
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        recover(ring_path, Path(config["run_folder"]))
     return 0
 
 
 def _run(servo: Servo) -> bool:
     """Cycle until asked to exit, or until the supervisor has been gone for good; True for the latter."""
     parent_pid = os.getppid()
+    leaving = 0
     while True:
         servo.cycle()
-        resting = servo.phase in (Phase.IDLE, Phase.HOMED_DRIVE, Phase.STOPPED)
+        resting = servo.phase in RESTING
         if resting and servo.mode is Mode.EXIT:
-            return False
+            leaving += 1
+            if leaving > 1 and (servo.released or leaving > RELEASE_CYCLES):
+                return False
         if resting and servo.supervisor_silence_s > _ORPHAN_S and os.getppid() != parent_pid:
             return True
 

@@ -4,6 +4,7 @@ Configures the drives, starts the servo, asks it by requests and segments, drain
 never computes a command and nothing that the servo waits for.
 """
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,14 +18,15 @@ from drivers.arming import DriveMapping, DriveSettings, configure
 from drivers.canopen_master import Master
 from stagectl import trajectory as trajectories
 from stagectl.backend import SEGMENT_ROWS, Backend, ServoLink
-from stagectl.errors import DriveError, LinkError, RequestError, TimingError
+from stagectl.errors import DriveError, LinkError, RecordError, RequestError, StagectlError, TimingError
 from stagectl.plant import PLANT_PARAMETERS
 from stagectl.profile import Profile
 from stagectl.record import Recorder
 from stagectl.replay import describe_mapping
-from stagectl.requests import Mode, Phase
+from stagectl.requests import RESTING, Mode, Phase
 from stagectl.signals import SETPOINT, STOP_TEXT, Stop
 from stagectl.tracker import LAW_NAMES
+from stagectl.undisturbed import undisturbed
 
 _STEP_S = 0.02
 _SENSOR_TIMEOUT_S = 5.0
@@ -37,6 +39,9 @@ _JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_
 _PLAN_SHARE = 0.9  # of the profile's limits that planned moves use
 _JERK_TIME_S = 0.1
 _QUICK_STOP_HOLD, _QUICK_STOP_OFF = 6, 2
+_RESET_TIMEOUT_S = 2.0
+_HEARTBEATS_MISSED = 2  # looks in a row that find a heartbeat too old
+_FAULTS = (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE)
 
 Progress = Callable[[str, float], None]
 
@@ -79,11 +84,13 @@ class Outcome:
     first_row: int
     rows: int
     backlash: BacklashEstimate | None = None
+    detail: str = ""
+    """Where, the value, its limit and the remedy, of a stop that has them."""
 
     @property
     def text(self) -> str:
         """The sentence for the operator."""
-        return STOP_TEXT[self.stop]
+        return f"{STOP_TEXT[self.stop]}: {self.detail}" if self.detail else STOP_TEXT[self.stop]
 
     @property
     def finished(self) -> bool:
@@ -145,14 +152,22 @@ class Supervisor:
         self._homing_id = 0
         self._belief = np.zeros(1, PLANT_PARAMETERS)
         self._holds_lease = False
+        self._watches = False
+        self._heartbeats_missed: dict[str, int] = {}
+        self._reason = ""  # why this side asked the servo to stop
+        self._trouble: StagectlError | None = None  # raised as soon as the stage rests
         self.mappings: dict[str, DriveMapping] = {}
 
     def __enter__(self) -> "Supervisor":
-        self.connect()
+        try:
+            self.connect()
+        except BaseException:
+            self._close(quiet=True)
+            raise
         return self
 
     def __exit__(self, kind, error, trace) -> None:
-        self.close()
+        self._close(quiet=error is not None)
 
     # ---- parts -----------------------------------------------------------------------------------------------
 
@@ -181,17 +196,78 @@ class Supervisor:
         """Return the servo's newest state (STATUS)."""
         return self.link.status.read()[1][0]
 
+    @property
+    def detail(self) -> str:
+        """What the last stop has to say beyond its `STOP_TEXT`; empty where nothing stopped."""
+        status = self.status()
+        if status["stop"] == Stop.NONE:
+            return ""
+        return status["text"].tobytes().rstrip(b"\0").decode(errors="replace") or self._reason
+
+    def _outcome(self, name: str, stop: Stop, first_row: int, backlash: BacklashEstimate | None = None) -> Outcome:
+        detail = "" if stop is Stop.FINISHED else self.detail
+        return Outcome(name, stop, first_row, self.recorder.rows_count - first_row, backlash, detail)
+
     # ---- time ------------------------------------------------------------------------------------------------
 
     def pump(self, duration_s: float = _STEP_S) -> np.void:
-        """Let time pass: renew counter and lease, drain the ring; returns the newest state."""
+        """Let time pass: renew counter and lease, drain the ring, watch the drives; returns the newest state.
+
+        What goes wrong on this side (full disk, dead receiver) first brings the stage to rest, and is raised then.
+        """
         link = self.link
         self._counter += 1
         lease_ns = round(self.profile.trip.lease_s * 1e9) if self._holds_lease else 0
         link.requests.publish({"counter": self._counter, "lease_until_t_ns": link.now_t_ns() + lease_ns})
         link.pass_time(duration_s)
-        self.recorder.append(link.rows.read_new())
-        return self.status()
+        with undisturbed():  # rows that left the ring must reach the recorder
+            try:
+                self.recorder.append(link.rows.read_new())
+            except RecordError as error:
+                self._distress(Stop.RECORD_LOST, str(error), error)
+        if self._watches:
+            self._watch_drives()
+        status = self.status()
+        if self._trouble is not None and status["phase"] in RESTING:
+            trouble, self._trouble = self._trouble, None
+            raise trouble
+        return status
+
+    def _distress(self, stop: Stop, reason: str, trouble: StagectlError | None = None) -> None:
+        """Have the servo bring the stage to rest under its law; `trouble` is raised when it has."""
+        if trouble is not None and self._trouble is None:
+            self._trouble = trouble
+        if self.status()["phase"] not in RESTING and not self._reason:
+            self._reason = reason
+            self._event("distress", stop=stop.name, text=reason)
+            self._request(mode=int(Mode.STOP), stop=int(stop))
+
+    def _watch_drives(self) -> None:
+        """Record emergencies; stop where a drive's heartbeat is missed twice running (a host's hiccup misses once)."""
+        limit_s = self.profile.trip.heartbeat_s
+        try:
+            for emergency in self.master.emergencies():
+                self._event("emergency", node_id=emergency.node_id, code=emergency.code, text=str(emergency))
+            ages_s = {axis: self.master.heartbeat_age_s(mapping.node_id) for axis, mapping in self.mappings.items()}
+        except LinkError as error:
+            self._watches = False
+            self._distress(Stop.LINK_LOST, str(error), error)
+            return
+        for axis, age_s in ages_s.items():
+            missed = self._heartbeats_missed.get(axis, 0)
+            self._heartbeats_missed[axis] = 0 if age_s <= limit_s else missed + 1
+            node_id = self.mappings[axis].node_id
+            if age_s <= limit_s and missed >= _HEARTBEATS_MISSED:
+                self._event("heartbeat_back", axis=axis, node_id=node_id)
+            elif missed + 1 == _HEARTBEATS_MISSED and not age_s <= limit_s:
+                self._event("heartbeat_lost", axis=axis, node_id=node_id, age_s=age_s)
+        lost = [axis for axis, missed in self._heartbeats_missed.items() if missed >= _HEARTBEATS_MISSED]
+        if lost:
+            said = [f"{axis} (node {self.mappings[axis].node_id}): {ages_s[axis] * 1e3:.0f} ms ago" for axis in lost]
+            self._distress(
+                Stop.HEARTBEAT_LOST,
+                f"the last of {', '.join(said)}, limit {limit_s * 1e3:g} ms; check the drive's power and firmware",
+            )
 
     def _wait(self, done: Callable[[np.void], bool], timeout_s: float, what: str, share: float = 0.0) -> np.void:
         """Pump until `done`; a servo that stopped by itself ends the wait too; TimingError after the timeout."""
@@ -205,7 +281,10 @@ class Supervisor:
             self._progress(what, share)
 
     def _event(self, name: str, **fields: Any) -> None:
-        self.recorder.event(name, self.link.now_t_ns(), **fields)
+        try:
+            self.recorder.event(name, self.link.now_t_ns(), **fields)
+        except RecordError as error:  # the recorder holds it until there is room
+            self._distress(Stop.RECORD_LOST, str(error), error)
 
     # ---- arming ----------------------------------------------------------------------------------------------
 
@@ -235,9 +314,30 @@ class Supervisor:
         master.nmt(0, "start")
         self._request(mode=int(Mode.IDLE))
         self._event("connected", backend=self.backend.name, profile=profile.name)
-        status = self._wait(lambda s: bool(s["sensor_ready"]), _SENSOR_TIMEOUT_S, "waiting for the interferometer")
+        self._await_sensor()
+        self._watches = True
+
+    def _await_sensor(self) -> np.void:
+        """Wait until the sensor's clock is locked; LinkError says what the interferometer lacks."""
+        try:
+            status = self._wait(lambda s: bool(s["sensor_ready"]), _SENSOR_TIMEOUT_S, "waiting for the interferometer")
+        except TimingError as error:
+            raise LinkError(self._sensor_text()) from error
         if not status["sensor_ready"]:
-            raise LinkError("the interferometer sends no valid sample; check beam, port and format of the profile")
+            raise LinkError(f"{STOP_TEXT[Stop(int(status['stop']))]}: {self.detail}")
+        return status
+
+    def _sensor_text(self) -> str:
+        """Say what came of the interferometer in the last second instead of valid samples."""
+        sensor, rows = self.profile.interferometer, self.link.rows.read_last(round(self.profile.cycle.rate_hz))
+        bytes_count = int(rows["sensor_bytes_count"].sum())
+        if bytes_count == 0:
+            found = "nothing came; check its power and cable, and interferometer.port"
+        elif np.all(rows["sensor_arrival_t_ns"] == 0) or not np.any(np.diff(rows["macro_counts"])):
+            found = f"{bytes_count} bytes came in the last second, no valid frame; check beams, format and baud rate"
+        else:
+            found = f"samples come too seldom; check rate_hz = {sensor.rate_hz:g} and the beams"
+        return f"interferometer {sensor.port}: no steady valid samples within {_SENSOR_TIMEOUT_S:g} s: {found}"
 
     def _request(self, **fields: Any) -> None:
         self._counter += 1
@@ -269,8 +369,13 @@ class Supervisor:
         """Enable both drives and hold where the stage is; returns why not, NONE when it holds."""
         if self.status()["phase"] == Phase.TRACKING:
             return Stop.NONE
+        if any(missed >= _HEARTBEATS_MISSED for missed in self._heartbeats_missed.values()):
+            return Stop.HEARTBEAT_LOST
         self._holds_lease = True
-        self._request(mode=int(Mode.TRACK), law_number=LAW_NAMES.index(law or self.profile.control.law))
+        self._reason = ""
+        self._request(
+            mode=int(Mode.TRACK), stop=int(Stop.NONE), law_number=LAW_NAMES.index(law or self.profile.control.law)
+        )
         self.pump()
         status = self._wait(lambda s: s["phase"] == Phase.TRACKING, 5.0, "enabling the drives")
         return Stop(int(status["stop"]))
@@ -280,7 +385,7 @@ class Supervisor:
         phase = self.status()["phase"]
         if phase in (Phase.IDLE, Phase.HOMED_DRIVE):
             return Stop.NONE
-        self._request(mode=int(Mode.STOP))
+        self._request(mode=int(Mode.STOP), stop=int(Stop.NONE))
         status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "stopping")
         self._holds_lease = False
         stop = Stop(int(status["stop"]))
@@ -288,27 +393,87 @@ class Supervisor:
             self.acknowledge()
         return stop
 
-    def acknowledge(self) -> None:
-        """Acknowledge why the servo stopped; enables nothing."""
-        self._request(mode=int(Mode.IDLE), acknowledge_number=self._counter + 1)
-        self._wait(lambda s: s["phase"] == Phase.IDLE, 2.0, "acknowledging")
+    def acknowledge(self) -> Stop:
+        """Acknowledge why the servo stopped, reset drives in fault; enables nothing. Returns what stops it again.
+
+        DriveError where a drive stays in fault.
+        """
+        self._wait(lambda s: s["phase"] in RESTING, 20.0, "coming to rest")
+        self._reason = ""
+        self._request(mode=int(Mode.RESET), stop=int(Stop.NONE), acknowledge_number=self._counter + 1)
+        self._pump_until(lambda s: s["phase"] != Phase.STOPPED, 0.5)
+        status = self._pump_until(lambda s: not self._failed(s), _RESET_TIMEOUT_S)
+        self._request(mode=int(Mode.IDLE))
+        if status["phase"] == Phase.STOPPED:
+            return Stop(int(status["stop"]))
+        failed = self._failed(status)
+        if failed:
+            raise DriveError(
+                f"{' and '.join(failed)} still in fault {_RESET_TIMEOUT_S:g} s after the reset; clear its cause "
+                "(the events hold its emergency messages), then acknowledge again"
+            )
+        return Stop.NONE
+
+    def _pump_until(self, done: Callable[[np.void], bool], timeout_s: float) -> np.void:
+        until_t_ns = self.link.now_t_ns() + round(timeout_s * 1e9)
+        status = self.pump()
+        while not done(status) and self.link.now_t_ns() < until_t_ns:
+            status = self.pump()
+        return status
+
+    def _failed(self, status: np.void) -> list[str]:
+        """Name the drives that are in fault."""
+        named = {axis: cia402.state_of(int(status[f"{axis}_statusword"])) for axis in self.mappings}
+        return [f"{axis} (node {self.mappings[axis].node_id})" for axis, state in named.items() if state in _FAULTS]
 
     def close(self) -> None:
-        """Rest, power off, rows to disk; safe to call after any failure."""
-        if self._link is not None and self._recorder is not None:
-            stop = Stop.NONE
+        """Rest, power off, rows to disk; lets go of everything whatever fails, and raises what failed."""
+        self._close(quiet=False)
+
+    def _close(self, quiet: bool) -> None:
+        """Close; `quiet` where an error is under way already that says more than what follows from it."""
+        link, recorder, master = self._link, self._recorder, self._master
+        self._master = None
+        with contextlib.ExitStack() as stack:
+            stack.callback(self.backend.close)
+            if master is not None:
+                stack.callback(master.close)
+            if recorder is not None and link is None:
+                stack.callback(recorder.abandon)
+            if recorder is not None and link is not None:
+                end: dict[str, Any] = {"stop": Stop.NONE.name, "text": STOP_TEXT[Stop.NONE]}
+                stack.callback(self._end_run, link, recorder, end)
+                self._rest(end, quiet)
+
+    def _rest(self, end: dict[str, Any], quiet: bool) -> None:
+        """Bring the stage to rest and fill in how the run ended."""
+        self._watches = False
+        try:
+            detail = self.detail
+            stop = self.disarm()
+            self.pump(0.1)
+            end.update(stop=stop.name, text=STOP_TEXT[stop], detail=detail)
+            status = self.status()
+            end.update({name: int(status[name]) for name in ("lost_samples", "discarded_bytes", "missed_cycles")})
+        except StagectlError as error:
+            stop = Stop(int(self.status()["stop"])) or Stop.LINK_LOST
+            end.update(stop=stop.name, text=STOP_TEXT[stop], detail=self.detail or str(error))
+            if not quiet:
+                raise
+
+    def _end_run(self, link: ServoLink, recorder: Recorder, end: dict[str, Any]) -> None:
+        """End the servo, which first stops what moves, and put its last rows on the disk."""
+        with undisturbed():
+            self._link = None
+            link.close()
             try:
-                stop = self.disarm()
-                self.pump(0.1)
-            finally:
-                self._link.close()
-                self._recorder.append(self._link.rows.read_new())
-                self._recorder.close({"stop": stop.name, "text": STOP_TEXT[stop]})
-                self._link = None
-        if self._master is not None:
-            self._master.close()
-            self._master = None
-        self.backend.close()
+                with contextlib.suppress(RecordError):  # held; closing says so where it still finds no room
+                    recorder.append(link.rows.read_new())
+                recorder.close(end)
+            except RecordError:
+                recorder.abandon()  # what is not on the disk stays in the ring
+                raise
+            link.forget_rows()
 
     # ---- homing ----------------------------------------------------------------------------------------------
 
@@ -317,8 +482,9 @@ class Supervisor:
         first_row = self.recorder.rows_count
         stop = self._home_drive()
         if stop is not Stop.NONE:
-            return Outcome("home", stop, first_row, self.recorder.rows_count - first_row)
-        status = self.pump(0.3)
+            return self._outcome("home", stop, first_row)
+        self.pump(0.3)
+        status = self._await_sensor()
         macro_scale, end_scale = self._scales()
         macro_zero = float(status["macro_counts"]) - float(status["macro_encoder_m"]) / macro_scale
         # At rest without power the spring stands at its middle: end = macro there, until the edges say better.
@@ -329,14 +495,14 @@ class Supervisor:
         if self.profile.micro is not None:
             stop = self.enable()
             if stop is not Stop.NONE:
-                return Outcome("home", stop, first_row, self.recorder.rows_count - first_row)
+                return self._outcome("home", stop, first_row)
             outcome = self._touch()
             estimate = outcome.backlash
             if not outcome.finished or estimate is None:
-                return Outcome("home", outcome.stop, first_row, self.recorder.rows_count - first_row)
+                return self._outcome("home", outcome.stop, first_row)
             self.take_backlash(estimate)
         self._event("homing", number=self._homing_id, macro_zero_counts=macro_zero, end_zero_counts=end_zero)
-        return Outcome("home", Stop.FINISHED, first_row, self.recorder.rows_count - first_row, estimate)
+        return self._outcome("home", Stop.FINISHED, first_row, estimate)
 
     def _touch(self) -> Outcome:
         """Sweep until both edges have been pressed; a first guess of the end's zero may be off by half the gap.
@@ -397,7 +563,17 @@ class Supervisor:
         return stop
 
     def take_backlash(self, estimate: BacklashEstimate) -> None:
-        """Believe an identified backlash; the end's zero moves so that the gap's centre is where the profile has it."""
+        """Believe an identified backlash; the end's zero moves so that the gap's centre is where the profile has it.
+
+        RequestError where it is none.
+        """
+        stiffnesses = (estimate.left_stiffness_n_per_m, estimate.right_stiffness_n_per_m)
+        believable = math.isfinite(estimate.centre_m) and 0.0 < estimate.width_m < math.inf
+        if not (believable and all(0.0 < stiffness < math.inf for stiffness in stiffnesses)):
+            raise RequestError(
+                f"backlash of {estimate.width_m:g} m about {estimate.centre_m:g} m with {stiffnesses} N/m: every value "
+                "must be finite, width and stiffness above 0; identify again, touching both edges"
+            )
         status = self.status()
         macro_scale, end_scale = self._scales()
         before_m = float(status["end_counts"]) * end_scale - float(status["end_position_m"])
@@ -448,10 +624,13 @@ class Supervisor:
                 stop = Stop.FINISHED
                 break
             if self.link.now_t_ns() > until_t_ns:
-                raise TimingError(f"{name}: not done after {duration_s * 1.5 + 5.0:g} s; is the sensor's rate_hz right?")
+                raise TimingError(
+                    f"{name}: not done after {duration_s * 1.5 + 5.0:g} s; is the sensor's rate_hz right?"
+                )
             self._progress(name, 1.0 - float(status["segment_left_rows"]) / setpoints.size)
-        self._event("segment_end", number=number, stop=stop.name)
-        return Outcome(name, stop, first_row, self.recorder.rows_count - first_row, self._backlash(status))
+        detail = "" if stop is Stop.FINISHED else self.detail
+        self._event("segment_end", number=number, stop=stop.name, **({"detail": detail} if detail else {}))
+        return self._outcome(name, stop, first_row, self._backlash(status))
 
     def _backlash(self, status: np.void) -> BacklashEstimate | None:
         if self.profile.micro is None:
@@ -463,7 +642,9 @@ class Supervisor:
     def _limits(self) -> trajectories.Limits:
         macro = self.profile.macro
         acceleration = _PLAN_SHARE * min(macro.acceleration_limit_m_per_s2, 0.5 * macro.stop_deceleration_m_per_s2)
-        return trajectories.Limits(_PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S)
+        return trajectories.Limits(
+            _PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S
+        )
 
     def move(self, target_m: float, law: str | None = None) -> Outcome:
         """Move the end to a position, jerk-limited; checked before the first cycle."""
@@ -515,7 +696,9 @@ class Supervisor:
             raise RequestError(f"{name}: this stage has no micro; there is no backlash to identify")
         status = self.status()
         self._centre(status)
-        stiffness = max(float(self._belief["left_stiffness_n_per_m"][0]), float(self._belief["right_stiffness_n_per_m"][0]))
+        stiffness = max(
+            float(self._belief["left_stiffness_n_per_m"][0]), float(self._belief["right_stiffness_n_per_m"][0])
+        )
         width_m = float(self._belief["left_m"][0]) + float(self._belief["right_m"][0])
         press_m = force_share * self.profile.backlash.touch_force_n / stiffness
         planned = trajectories.sweep(

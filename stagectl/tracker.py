@@ -67,6 +67,7 @@ class Tracker:
     def guide(self) -> None:
         """From here the macro's drive brakes by itself: what it reports is the force that the macro feels."""
         self.active.estimator["position_mode"] = 1.0
+        self.active.guard["braking"] = 1.0
 
     def switch(self, law_number: int) -> None:
         """Change the law; the new one starts from rest."""

@@ -1,9 +1,13 @@
 """Shipped profiles and machines, read once."""
 
 import pytest
+from hypothesis import settings
 
 from sim_backend.machine import load_machine
 from stagectl.profile import load_profile
+
+settings.register_profile("stagectl", deadline=None)  # a first call compiles
+settings.load_profile("stagectl")
 
 
 @pytest.fixture(scope="session")

@@ -33,8 +33,10 @@ class Loop:
         d["sample"] += 1.0
         self._advance(d["sample"] * d["period_s"])
 
-    def cycle(self, setpoint, *, fresh: bool = True, lost: bool = False, **measured: float) -> None:
-        """Run one cycle; `measured` overwrites fields of the measurement just before the tick."""
+    def cycle(
+        self, setpoint, *, fresh: bool = True, silent: bool = False, lost: bool = False, **measured: float
+    ) -> None:
+        """Run one cycle. Not fresh: its line comes a cycle late; silent: never. `measured` overwrites what is seen."""
         one = self.simulation
         d, m, c = one.devices[0], one.controller.measurement, one.controller.command
         t_s = d["sample"] * d["period_s"]
@@ -56,11 +58,12 @@ class Loop:
         m["lease_left_ns"] = 1_000_000_000
         m["samples_new"] = 0
         this = (int(d["sample"]), int(t_s * 1e9), *seen)
+        fresh = fresh and not silent
         for line in (self._late, this if fresh else None):
             if line is not None:
                 m["sequence"], m["sample_t_ns"], m["macro_position_m"], m["end_position_m"] = line
                 m["samples_new"] += 1
-        self._late = None if fresh else this
+        self._late = None if fresh or silent else this
         for name, value in measured.items():
             m[name] = value
         one.controller.setpoint[0] = setpoint

@@ -371,7 +371,7 @@ def test_the_same_run_twice_is_equal_to_the_last_bit():
     assert smooth(50e-6).state.tobytes() == smooth(50e-6).state.tobytes()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.lists(st.floats(1e-6, 0.0999), min_size=1, max_size=30), st.sampled_from(["gap", "contact"]))
 def test_arbitrary_instants_on_the_way_change_nothing(instants_s, where):
     """The rig is advanced to whatever is asked: SYNC, a sample, an arrival."""

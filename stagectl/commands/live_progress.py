@@ -22,7 +22,7 @@ class LiveProgress:
         self._bars = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
-            BarColumn(bar_width=28),
+            BarColumn(bar_width=28, complete_style="cyan", finished_style="green", pulse_style="cyan"),
             TimeElapsedColumn(),
             console=console,
             transient=True,

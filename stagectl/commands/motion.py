@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
-from stagectl.commands.opening import Place, ended, home_and_arm, law_name, opened, place
+from stagectl.commands.opening import Place, home_and_arm, law_name, opened, place
 from stagectl.commands.planning import Shape, kind_of, planned
 from stagectl.commands.scores_json import scores_json
 from stagectl.commands.tables import terminal
@@ -91,7 +91,7 @@ def _on_stage(
             outcome = motion(stage)
         position_m = float(stage.status()["end_position_m"])
         folder = stage.folder
-    return _answer(voice, folder, outcome.stop, ended(outcome), {"end_position_m": position_m})
+    return _answer(voice, folder, outcome.stop, f"{outcome.name}: {outcome.text}", {"end_position_m": position_m})
 
 
 class _ValueSeam:

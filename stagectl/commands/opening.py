@@ -1,15 +1,15 @@
 """Open a stage for a command: progress and interrupts reach it, and whatever happens it comes to rest and is closed."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from stagectl.commands.answer import Voice
-from stagectl.errors import RequestError
+from stagectl.errors import RequestError, StagectlError
 from stagectl.profile import Profile, load_profile
 from stagectl.run_scores import VALUE_SEAM, write_truth
-from stagectl.signals import STOP_TEXT, Stop
+from stagectl.signals import Stop
 from stagectl.stage import BACKENDS, open_stage
 from stagectl.suggestion import closest
 from stagectl.supervisor import Outcome, Supervisor
@@ -58,25 +58,23 @@ def opened(where: Place, name: str, voice: Voice) -> Iterator[Supervisor]:
         seed=where.seed,
         progress=voice.progress,
     )
-    connected = False
-    try:
-        voice.note(f"{where.profile.name} on {stage.backend.description}")
-        if where.backend == "auto" and stage.backend.name != "hardware":
-            voice.note("auto: neither the profile's CAN interface nor its serial port is here, so the rig plays it")
-        voice.run_folder = stage.folder
-        stage.connect()
-        connected = True
-        yield stage
-    finally:
-        voice.hush()
+    voice.note(f"{where.profile.name} on {stage.backend.description}")
+    if where.backend == "auto" and stage.backend.name != "hardware":
+        voice.note("auto: neither the profile's CAN interface nor its serial port is here, so the rig plays it")
+    voice.run_folder = stage.folder
+    with stage:
         try:
-            if connected:
-                _rest(stage)
-        finally:
-            stage.close()
+            yield stage
+        except BaseException:
+            voice.hush()
+            with suppress(StagectlError):  # what is under way already says more than what follows from it
+                _keep_truth(stage)
+            raise
+        voice.hush()
+        _keep_truth(stage)
 
 
-def _rest(stage: Supervisor) -> None:
+def _keep_truth(stage: Supervisor) -> None:
     """Bring the stage to rest and keep what was true, while there is somebody who knows."""
     stage.disarm()
     truth = stage.backend.truth()
@@ -93,8 +91,3 @@ def home_and_arm(stage: Supervisor, law: str | None = None) -> Outcome:
         return homed
     stop = stage.enable(law)
     return homed if stop is Stop.NONE else Outcome("enable", stop, homed.first_row, homed.rows)
-
-
-def ended(outcome: Outcome) -> str:
-    """Say how a motion ended."""
-    return f"{outcome.name}: {STOP_TEXT[outcome.stop]}"

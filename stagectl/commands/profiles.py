@@ -56,6 +56,7 @@ def _grow(tree: Tree, values: dict[str, Any]) -> None:
 def names(voice: Voice) -> Answer:
     """List every profile that a bare name can mean, with what is wrong where something is."""
     table = Table("name", "axes", "rate", "law", "file", box=None, pad_edge=False, header_style="bold")
+    table.columns[-1].overflow = "fold"
     data = []
     for name in list_profiles():
         try:

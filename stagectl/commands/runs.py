@@ -9,6 +9,7 @@ from stagectl import runs
 from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
 from stagectl.errors import RecordError, RequestError
 from stagectl.record import MANIFEST, read_run, recover_orphans
+from stagectl.signals import STOP_TEXT, Stop
 from stagectl.suggestion import closest
 
 LATEST = "latest"
@@ -35,22 +36,33 @@ def names(voice: Voice, runs_root: Path) -> Answer:
     recovered = []
     for ring, outcome in recover_orphans():
         if isinstance(outcome, RecordError):
-            voice.warn(str(outcome))
+            voice.warn(f"{outcome}; or remove {ring} where its rows are not wanted")
             recovered.append({"ring": ring, "error": str(outcome)})
         else:
-            voice.note(f"{ring}: {outcome.rows_count} rows of a dead servo recovered, {outcome.rows_lost_count} lost")
+            if outcome.rows_count or outcome.rows_lost_count:
+                counts = f"{outcome.rows_count} rows of a dead servo recovered, {outcome.rows_lost_count} lost"
+                voice.note(f"{ring}: {counts}")
             recovered.append({"ring": ring, **asdict(outcome)})
     found = runs.list_runs(runs_root)
     table = Table("run", "state", "rows", "time", "profile", "ended", box=None, pad_edge=False, header_style="bold")
     for column in (2, 3):
         table.columns[column].justify = "right"
+    table.columns[0].no_wrap = True
     for one in found:
         style = _STATE_STYLE.get(one.state, "red")
         state = f"[{style}]{one.state}[/]"
-        ended = one.note or one.stop
-        table.add_row(one.folder.name, state, str(one.rows_count), f"{one.duration_s:.1f} s", one.profile, ended)
+        duration = f"{one.duration_s:.1f} s"
+        table.add_row(one.folder.name, state, str(one.rows_count), duration, one.profile, one.note or _ending(one.stop))
     shown = [table] if found else [f"{runs_root} holds no runs yet; `stagectl demo` makes one"]
     return Answer({"runs": [asdict(one) for one in found], "recovered": recovered}, shown)
+
+
+def _ending(stop: str) -> str:
+    """Say why a run ended; nothing where somebody simply closed it."""
+    known = Stop.__members__.get(stop)
+    if known in (Stop.NONE, Stop.OPERATOR):
+        return ""
+    return stop if known is None else STOP_TEXT[known]
 
 
 def show(voice: Voice, run: str, runs_root: Path) -> Answer:

@@ -29,6 +29,7 @@ def _motion(motion: MotionScore) -> dict[str, Any]:
         "measured": _errors(motion.measured),
         "settling": None if settled is None else asdict(settled),
         "contact_ratio": motion.contact_ratio,
+        "missed_cycles_count": motion.missed_cycles_count,
     }
 
 

@@ -150,8 +150,6 @@ def carrier(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n
     known_n += disturbance_n
     e = ahead.macro_position_m - (later.position_m - later.relative_position_m + gap_centre(q))
     de = ahead.macro_velocity_m_per_s - (later.velocity_m_per_s - later.relative_velocity_m_per_s)
-    acceleration = (
-        later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
-    )
+    acceleration = later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
     wanted = acceleration - law.macro_stiffness_per_s2 * e - law.macro_damping_per_s * de
     return limited(mass_kg * wanted - known_n, law.macro_force_limit_n)

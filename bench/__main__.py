@@ -1,0 +1,92 @@
+"""`python -m bench NAME`: measure what the project promises, and hold it against the bars.
+
+Exit 0: every bar holds (or could not be measured here, with the reason); 1: one does not; 2: wrong usage.
+"""
+
+import argparse
+import importlib
+import json
+import os
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+from bench.figure import Figure
+
+NAMES = ("main_job",)
+
+
+def _arguments(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m bench", description="Measure the project's figures.")
+    parser.add_argument("name", choices=NAMES, help="which set of figures")
+    parser.add_argument("--json", action="store_true", help="print one JSON object a figure")
+    parser.add_argument("--full", action="store_true", help="more seeds and longer runs")
+    parser.add_argument("--out", type=Path, help="write what is printed to this file as well")
+    parser.add_argument("--markdown", type=Path, help="write the table with date and host load to this file")
+    return parser.parse_args(argv)
+
+
+def _value(figure: Figure) -> str:
+    return "-" if figure.value is None else f"{figure.value:.3g} {figure.unit}"
+
+
+def _verdict(figure: Figure) -> str:
+    return {True: "holds", False: "MISSED", None: "-"}[figure.holds]
+
+
+def _seeds(seeds: list[int]) -> str:
+    if len(seeds) > 2 and seeds == list(range(seeds[0], seeds[-1] + 1)):
+        return f"{seeds[0]}-{seeds[-1]}"
+    return ", ".join(map(str, seeds))
+
+
+def table(figures: Iterable[Figure]) -> str:
+    """Lay figures out as a Markdown table, aligned for a terminal too."""
+    rows = [("figure", "value", "bar", "verdict", "seeds", "remark")]
+    rows += [(f.figure, _value(f), f.bar, _verdict(f), _seeds(f.seeds), f.reason) for f in figures]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
+    ]
+    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
+    return "\n".join(lines)
+
+
+def _page(name: str, figures: list[Figure], load: str, took_s: float) -> str:
+    day = time.strftime("%Y-%m-%d")
+    return (
+        f"# Figures: {name}\n\n"
+        f"Written by `make bench` on {day}; {took_s:.0f} s on {os.cpu_count()} CPUs. {load}\n"
+        "Where there are several seeds the worst of them stands here. Bars are written in `bench/main_job.py`.\n\n"
+        f"{table(figures)}\n"
+    )
+
+
+def _load() -> str:
+    one, five, fifteen = os.getloadavg()
+    return f"{one:.2f} / {five:.2f} / {fifteen:.2f}"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure, print, judge."""
+    arguments = _arguments(argv)
+    begin_s, load = time.monotonic(), _load()
+    module = importlib.import_module(f"bench.{arguments.name}")
+    figures = list(module.figures(full=arguments.full, say=lambda text: print(text, file=sys.stderr, flush=True)))
+    load = f"Load average of the host (1 / 5 / 15 min): {load} before, {_load()} after."
+    if arguments.json:
+        text = "\n".join(json.dumps(figure.as_json()) for figure in figures)
+    else:
+        text = f"{table(figures)}\n{load}"
+    print(text)
+    if arguments.out is not None:
+        arguments.out.write_text(text + "\n")
+    if arguments.markdown is not None:
+        arguments.markdown.parent.mkdir(parents=True, exist_ok=True)
+        arguments.markdown.write_text(_page(arguments.name, figures, load, time.monotonic() - begin_s))
+    return 1 if any(figure.holds is False for figure in figures) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
