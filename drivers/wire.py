@@ -26,6 +26,7 @@ SYNC_FRAME = (SYNC_ID, b"")
 BOTH_VALID = MACRO_VALID | END_VALID
 _NO_ERROR = b"\0\0"  # an EMCY that takes the one before back
 _DISAGREEMENTS_IN_A_ROW = 5  # a host that holds a SYNC up by a millisecond is no lost reference
+_CLOCK_SAMPLES = 200  # before the sample clock can tell that a number came too early
 _EARLIEST_SHARE = 0.5  # of the transport's constant part: no line of a sample younger than this can be there
 
 
@@ -81,6 +82,8 @@ class WireDecoder:
         self.mappings = dict(mappings)
         self.period_ns = 1e9 / sensor.rate_hz
         self.clock = sample_clock.init(self.period_ns, sensor.transport_s * 1e9)
+        self._fresh_clock = self.clock.copy()
+        self.restarts = 0
         air = profile.air
         self.air_index = ciddor_index(
             air.wavelength_vacuum_m, air.temperature_degc, air.pressure_pa, air.relative_humidity_percent, air.co2_ppm
@@ -149,6 +152,25 @@ class WireDecoder:
             self.end_zero_counts = self.end_counts
         return True
 
+    def _renumbers(self, reading: Reading, arrival_t_ns: int) -> bool:
+        """Tell whether the device began to count anew: back, or ahead so that a sample is here before its instant.
+
+        Either latches *reference lost*: nobody knows what else it forgot.
+        """
+        if reading.flags & RESTARTED:
+            return True
+        if reading.sequence <= self.sequence + 1 or self.sequence < 0:
+            return False
+        early_ns = int(sample_clock.sample_t_ns(self.clock, reading.sequence)) - arrival_t_ns
+        if self.clock["samples"][0] < _CLOCK_SAMPLES or early_ns <= 0.5 * self.period_ns:
+            return False
+        skipped = reading.sequence - self.sequence - 1
+        self._lose_reference(
+            f"the interferometer's numbers jumped ahead by {skipped}: sample {reading.sequence} came "
+            f"{early_ns * 1e-6:.1f} ms before its instant"
+        )
+        return True
+
     def _lose_reference(self, text: str) -> None:
         """Latch it; the first cause stays."""
         if not self.reference_lost:
@@ -192,9 +214,11 @@ class WireDecoder:
         text = ""
         if inbox.sensor_bytes:
             for reading in self.framer.feed(inbox.sensor_bytes):
-                sample_clock.step(self.clock, reading.sequence, inbox.sensor_arrival_t_ns)
-                if reading.flags & RESTARTED:
+                if self._renumbers(reading, inbox.sensor_arrival_t_ns):
+                    self.clock[...] = self._fresh_clock
                     self.cycle = -1
+                    self.restarts += 1
+                sample_clock.step(self.clock, reading.sequence, inbox.sensor_arrival_t_ns)
                 valid += self._take_reading(reading)
         try:
             self._take_frames(inbox, m)

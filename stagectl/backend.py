@@ -129,26 +129,35 @@ class BatchTransport:
         """Let everything happen until the deadline, line by line, so that each has its own arrival."""
         wire = self._wire
         inbox.sensor_bytes, self._kept = self._kept[:CHUNK_LIMIT_BYTES], self._kept[CHUNK_LIMIT_BYTES:]
-        while not self._kept and not self._port_failed and (line_t_ns := wire.next_line_t_ns()) <= deadline_t_ns:
+        until_t_ns = max(deadline_t_ns, wire.t_ns)
+        while not self._kept and not self._port_failed and (line_t_ns := wire.next_line_t_ns()) <= until_t_ns:
             wire.advance_to(line_t_ns)
-            try:
-                data = wire.serial.read()
-            except LinkError as error:
-                self.failure = str(error)
-                self._port_failed = True
+            if not self._read(inbox):
                 break
-            if not data:
-                break
-            data = inbox.sensor_bytes + data
-            inbox.sensor_bytes, self._kept = data[:CHUNK_LIMIT_BYTES], data[CHUNK_LIMIT_BYTES:]
-            inbox.sensor_arrival_t_ns = wire.serial.arrival_t_ns
         wire.advance_to(deadline_t_ns)
+        if not inbox.sensor_bytes and not self._port_failed:
+            self._read(inbox)  # a port that is gone says so without a line
         while (frame := wire.cyclic.receive()) is not None:
             if frame[0] & ERROR_FLAG:
                 self.failure = error_frame_text(frame[0]) or self.failure
             elif frame[0] in self._names:
                 inbox.take(self._names[frame[0]], frame[1])
         return wire.t_ns
+
+    def _read(self, inbox: Inbox) -> bool:
+        """Take what has arrived; False where nothing has, or the port is gone."""
+        try:
+            data = self._wire.serial.read()
+        except LinkError as error:
+            self.failure = str(error)
+            self._port_failed = True
+            return False
+        if not data:
+            return False
+        data = inbox.sensor_bytes + data
+        inbox.sensor_bytes, self._kept = data[:CHUNK_LIMIT_BYTES], data[CHUNK_LIMIT_BYTES:]
+        inbox.sensor_arrival_t_ns = self._wire.serial.arrival_t_ns
+        return True
 
     def send(self, frames: list[tuple[int, bytes]]) -> tuple[bool, int]:
         """Queue frames after the tick's time; the bus's arbitration does the rest."""
@@ -438,7 +447,8 @@ class RigBackend(RealtimeBackend):
             asked.settimeout(5.0)
             asked.send(b"FILT")
             asked.send(b"RIG " + json.dumps(message).encode())
-            answer = asked.recv(1 << 16)
+            while not (answer := asked.recv(1 << 16)).startswith(b"RIG "):
+                pass  # frames that were under way before the filter took effect
         finally:
             asked.close()
         return json.loads(answer.removeprefix(b"RIG "))

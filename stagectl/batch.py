@@ -19,6 +19,7 @@ DEVICES = np.dtype(
         ("latch_delay_s", "f8"),  # sample instant -> SYNC that latches the command
         ("macro_resolution_m", "f8"),
         ("end_resolution_m", "f8"),
+        ("reading_ratio", "f8"),  # what the profile takes for a metre: its index of air is not quite the true one
         ("interpolation_speed_m_per_s", "f8"),  # up to it a count is divided further
         ("interpolation_count", "f8"),  # parts of a count then
         ("macro_zero_m", "f8"),  # subtracted from what the sensor sees: the run's own zero
@@ -87,8 +88,8 @@ def run(setpoints, noise_m, late, instants_s, devices, state, parameters, machin
         end_step_m = d.end_resolution_m
         if abs(s.end_velocity_m_per_s) <= d.interpolation_speed_m_per_s:
             end_step_m /= d.interpolation_count
-        macro_m = np.floor(macro_m / macro_step_m + 0.5) * macro_step_m - d.macro_zero_m
-        end_m = np.floor(end_m / end_step_m + 0.5) * end_step_m - d.end_zero_m
+        macro_m = np.floor(macro_m / macro_step_m + 0.5) * macro_step_m * d.reading_ratio - d.macro_zero_m
+        end_m = np.floor(end_m / end_step_m + 0.5) * end_step_m * d.reading_ratio - d.end_zero_m
         m.samples_new = 0
         if d.late_sample >= 0.0:  # the line of the sample before is here by now
             m.sequence = int(d.late_sample)
@@ -172,6 +173,7 @@ def simulation(controller: Controller, machine, *, latch_delay_s: float, seed: i
     # A count in vacuum: what the index of air takes from it (3e-4) matters to bytes, not to a resolution.
     count_m = machine.air.wavelength_vacuum_m / sensor.counts_per_wavelength
     devices["macro_resolution_m"] = devices["end_resolution_m"] = count_m
+    devices["reading_ratio"] = 1.0
     devices["interpolation_speed_m_per_s"] = -1.0
     devices["interpolation_count"] = 1.0
     if sensor.interpolation_speed_m_per_s is not None:

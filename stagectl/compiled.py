@@ -36,7 +36,7 @@ CACHE_FOLDER = _cache_root() / _sources_hash()
 """Holds the compiled code and the generated modules of these sources."""
 
 CACHE_FOLDER.mkdir(parents=True, exist_ok=True)
-numba.config.CACHE_DIR = str(CACHE_FOLDER / "numba")  # pyright: ignore[reportAttributeAccessIssue]
+numba.config.CACHE_DIR = str(CACHE_FOLDER / "numba")  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
 
 
 def compiled(function):

@@ -174,7 +174,7 @@ def step(g, m, now, macro_n, micro_n):
         return _MEASUREMENT_NOT_FINITE
     if not (np.isfinite(macro_n) and np.isfinite(micro_n)):
         return _COMMAND_NOT_FINITE
-    if not abs(macro_n) <= g.macro_force_limit_n:
+    if g.braking == 0.0 and not abs(macro_n) <= g.macro_force_limit_n:
         return _FORCE
     if g.has_micro != 0.0 and not abs(micro_n) <= g.micro_force_limit_n:
         return _FORCE

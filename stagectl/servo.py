@@ -134,7 +134,8 @@ class Servo:
         self._counter_t_ns = 0
         self._rows = 0
         self._valid_samples = 0
-        self._newest_sequence = -1
+        self._restarts = 0
+        self._grid_cycle = -1
         self._missed = 0
         self._command_lost = 0
         self._last_cycle = -1
@@ -173,9 +174,11 @@ class Servo:
         started_ns = self._clock_ns()
         self._decode(t_ns)
         self._valid_samples += int(m["samples_new"][0])
-        if int(m["sequence"][0]) < self._newest_sequence:  # it restarted: its clock has to be found again
+        if self.decoder.restarts != self._restarts:  # the sensor's clock has to be found again
+            self._restarts = self.decoder.restarts
             self._valid_samples = 0
-        self._newest_sequence = int(m["sequence"][0])
+            self._grid_cycle = -1
+        self._count_missed(int(m["cycle"][0]))
         self._read_request(t_ns)
         m["command_lost"][0] = self._command_lost
         m["overrun_ns"][0] = lateness_ns if lateness_ns > self._period_ns else 0
@@ -219,7 +222,7 @@ class Servo:
         if stop is not Stop.NONE:
             self._brake(stop, guided, t_ns)
         self._publish()
-        self._plan_next(t_ns)
+        self._plan_next()
 
     def _decode(self, t_ns: int) -> None:
         """Decode the inbox; bytes that can't be what was agreed, or none for good, end the run."""
@@ -260,16 +263,20 @@ class Servo:
         parts = (one.measurement[0], one.setpoint[0], one.command[0], one.guard[0])
         return stop_detail(stop, *parts, self._node_ids, LAW_NAMES[self.tracker.law_number])
 
-    def _plan_next(self, t_ns: int) -> None:
+    def _count_missed(self, cycle: int) -> None:
+        """Count the grid points between this cycle and the one before."""
+        if 0 <= self._grid_cycle < cycle - 1:
+            self._missed += cycle - 1 - self._grid_cycle
+        self._grid_cycle = cycle
+
+    def _plan_next(self) -> None:
         """Set the start of the next cycle: the sensor's next sample plus the phase, else a free-running period."""
         due = self.decoder.next_start_t_ns(self._phase_ns)
         if due == 0:
             due = self._deadline_t_ns + self._period_ns
         now = self.transport.now_t_ns()
-        if due <= now:  # the grid point is gone: skip to the next one and count
-            missed = (now - due) // self._period_ns + 1
-            self._missed += missed
-            due += missed * self._period_ns
+        if due <= now:  # the grid point is gone: skip to the next one
+            due += ((now - due) // self._period_ns + 1) * self._period_ns
         self._deadline_t_ns = due
 
     # ---- requests and phases ---------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from stagectl.undisturbed import undisturbed
 
 _STEP_S = 0.02
 _SENSOR_TIMEOUT_S = 5.0
+_INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
 _TOUCH_FREQUENCY_HZ = 0.7
 _TOUCH_S = 6.0
 _TOUCH_SHARE = 0.6  # of the touch force that the sweep aims at: the edges are not known yet
@@ -104,7 +105,7 @@ def drive_settings(profile: Profile, vendor_id: int | None) -> dict[str, DriveSe
     for axis_name in profile.axes:
         axis = profile.axis(axis_name)
         is_macro = axis_name == "macro"
-        step_m = axis.encoder_step_m if is_macro else getattr(axis, "encoder_step_m", None)
+        step_m = getattr(axis, "encoder_step_m", None)
         vendor = axis.identity.vendor_id if vendor_id is None else vendor_id
         product = axis.identity.product_code if vendor_id is None else None
         ramp = profile.macro.stop_deceleration_m_per_s2 / (step_m or profile.macro.encoder_step_m)
@@ -333,8 +334,8 @@ class Supervisor:
         bytes_count = int(rows["sensor_bytes_count"].sum())
         if bytes_count == 0:
             found = "nothing came; check its power and cable, and interferometer.port"
-        elif np.all(rows["sensor_arrival_t_ns"] == 0) or not np.any(np.diff(rows["macro_counts"])):
-            found = f"{bytes_count} bytes came in the last second, no valid frame; check beams, format and baud rate"
+        elif int(rows["samples_new"].sum()) == 0:
+            found = f"{bytes_count} bytes came in the last second, no valid sample; check beams, format and baud rate"
         else:
             found = f"samples come too seldom; check rate_hz = {sensor.rate_hz:g} and the beams"
         return f"interferometer {sensor.port}: no steady valid samples within {_SENSOR_TIMEOUT_S:g} s: {found}"
@@ -536,6 +537,13 @@ class Supervisor:
         decoder = WireDecoder(self.profile, self.mappings)
         return decoder.macro_m_per_count, decoder.end_m_per_count
 
+    def _homing_method(self) -> int:
+        """Return the profile's method; where the index was found before, search towards it (CiA 402, 33 and 34)."""
+        method = self.profile.macro.homing.method
+        if self._homing_id == 0 or method not in _INDEX_METHODS:
+            return method
+        return _INDEX_METHODS[1] if float(self.status()["macro_encoder_m"]) < 0.0 else _INDEX_METHODS[0]
+
     def _home_drive(self) -> Stop:
         """Let the macro's drive find its index."""
         homing, node = self.profile.macro.homing, self.profile.macro.node_id
@@ -543,7 +551,7 @@ class Supervisor:
         self.disarm()
         master = self.master
         master.write(node, cia402.MODES_OF_OPERATION, 0, cia402.MODE_HOMING)
-        master.write(node, cia402.HOMING_METHOD, 0, homing.method)
+        master.write(node, cia402.HOMING_METHOD, 0, self._homing_method())
         master.write(node, cia402.HOMING_SPEEDS, 1, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_SPEEDS, 2, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_ACCELERATION, 0, round(homing.acceleration_m_per_s2 / step_m))

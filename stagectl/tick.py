@@ -189,13 +189,14 @@ class Controller:
 
     def step(self) -> None:
         """Run one cycle on `measurement` and `setpoint`; the outcome stands in `command` and the states."""
-        if self.compiled_tick is None:
-            self.compiled_tick = direct(
+        compiled_tick = self.compiled_tick
+        if compiled_tick is None:
+            compiled_tick = self.compiled_tick = direct(
                 self.module.tick,
                 *(self.measurement, self.setpoint, self.later, self.command, self.estimator, self.model, self.ahead),
                 *(self.after, self.law, self.guard, self.backlash, self.belief, self.effects),
             )
-        self.compiled_tick(
+        compiled_tick(
             self.measurement,
             self.setpoint,
             self.later,

@@ -102,5 +102,3 @@ def belief_of(request: np.ndarray) -> np.ndarray:
     for name in PLANT_PARAMETERS.names or ():
         belief[name] = request[f"belief_{name}"]
     return belief
-
-

@@ -39,9 +39,7 @@ def home_by_truth(stage: Supervisor, plant: dict[str, float]) -> None:
 def trapezoid(stage: Supervisor, speed_m_per_s: float = SPEED_M_PER_S) -> trajectories.Trajectory:
     """Plan a short way there and back from where the stage holds."""
     start_m = float(stage.status()["setpoint_position_m"])
-    return trajectories.trapezoid(
-        STROKE_M, speed_m_per_s, (0.1, 0.05), dwell_s=0.1, start_m=start_m, lead_s=0.05
-    )
+    return trajectories.trapezoid(STROKE_M, speed_m_per_s, (0.1, 0.05), dwell_s=0.1, start_m=start_m, lead_s=0.05)
 
 
 def inject(*faults: Fault) -> Strike:
@@ -64,7 +62,7 @@ class Struck:
     struck_t_ns: int
     rows_written: int
     rest_velocity_m_per_s: float  # true, of the macro, 0.2 s after the outcome
-    error: BaseException | None = None
+    drive_states: tuple[str, ...]  # then
 
     @property
     def first_stop_row(self) -> int:
@@ -105,6 +103,11 @@ class Stage:
         """The true state, now."""
         return self.backend.rig.plant_state()
 
+    @property
+    def drive_states(self) -> tuple[str, ...]:
+        """The true power states, macro first."""
+        return tuple(node.drive.state.name for node in self.backend.rig.nodes)
+
     def arm(self) -> Stop:
         """Enable and bring the macro to the middle of the gap."""
         stop = self.stage.enable(self.law)
@@ -134,7 +137,9 @@ def struck(folder: Path, profile, machine, strike: Strike, law: str = "dsmc") ->
         outcome = one.move(strike)
         one.stage.pump(0.2)
         rest_m_per_s = abs(one.plant["macro_velocity_m_per_s"])
-    return Struck(outcome, read_run(folder), one.backend.truth(), one.struck_t_ns, rows_of(one), rest_m_per_s)
+        states = one.drive_states
+    run = read_run(folder)
+    return Struck(outcome, run, one.backend.truth(), one.struck_t_ns, rows_of(one), rest_m_per_s, states)
 
 
 def rows_of(one: Stage) -> int:

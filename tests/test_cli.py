@@ -104,13 +104,15 @@ def test_help_loads_nothing_heavy():
 
 
 def test_help_comes_at_once():
+    """Processor time: on an idle host the wall clock shows the same, on a shared one it shows the others' work."""
     command = [sys.executable, "-m", "stagectl.cli", "--help"]
     took_s = []
-    for _ in range(5):
-        began_s = time.monotonic()
+    for _ in range(4):
+        before = os.times()
         subprocess.run(command, capture_output=True, check=True, timeout=60)
-        took_s.append(time.monotonic() - began_s)
-    assert min(took_s) < 0.4  # the best of five: the tests share their host
+        after = os.times()
+        took_s.append(after.children_user + after.children_system - before.children_user - before.children_system)
+    assert min(took_s) < 0.4
 
 
 # ---- wrong usage and errors ---------------------------------------------------------------------------------------

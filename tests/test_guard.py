@@ -222,6 +222,7 @@ def test_a_late_line_is_no_following_error(cycle):
     cycle.stop()
     assert cycle.next(samples_new=0, sequence=1000, **late) is Stop.NONE
     assert cycle.next(samples_new=1, sequence=1001, **late) is Stop.NONE  # a line came, of the cycle before
+    assert cycle.next(samples_new=0, **late) is Stop.NONE  # a host that woke twice has nothing new to judge
     assert cycle.next(samples_new=1, **late) is Stop.FOLLOWING_ERROR
 
 

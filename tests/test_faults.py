@@ -1,0 +1,534 @@
+"""Everything that can go wrong at speed: a clear reason, a stage at rest, every row kept, an exact replay."""
+
+import contextlib
+import math
+import re
+from dataclasses import dataclass
+
+import can
+import numpy as np
+import pytest
+
+from drivers import cia402
+from drivers.wire import Inbox
+from sim_backend.faults import Fault
+from stagectl.backend import BatchBackend
+from stagectl.errors import DriveError, LinkError, RecordError, RequestError
+from stagectl.record import read_run
+from stagectl.replay import replay
+from stagectl.requests import Phase
+from stagectl.row import SENSOR_BYTES_COUNT
+from stagectl.signals import STOP_TEXT, Stop
+from stagectl.supervisor import BacklashEstimate, Supervisor
+from tests.small_disk import small_disk
+from tests.stage import with_values
+from tests.struck_stage import REST_M_PER_S, SEED, Stage, Strike, inject, struck
+
+MACRO, MICRO = 1, 2  # node ids
+MACRO_TPDO, MICRO_TPDO, MICRO_RPDO, SYNC = 0x181, 0x182, 0x202, 0x080
+EVERY_FRAME = (SYNC, 0x081, 0x082, 0x181, 0x182, 0x201, 0x202, 0x281, 0x282)
+POSITIVE_LIMIT, STO, PRESSURE = 0x2, 0x8, 0x1_0000
+ENCODER_FAULT = 0x7305
+HARD_STOP_M = 1e-3
+
+
+# ---- what does not stop a run -----------------------------------------------------------------------------------
+
+
+def hold_the_host_up(duration_s: float) -> Strike:
+    """Let the world go on while no cycle runs."""
+
+    def strike(stage, backend):
+        backend.wire.advance_to(backend.wire.t_ns + round(duration_s * 1e9))
+
+    return strike
+
+
+def test_small_disturbances_go_on_and_are_counted(tmp_path, oled_profile, oled_machine):
+    """Garbage, a half frame, three missing samples, late and doubled frames, a lost RPDO and SYNC, a slow host."""
+    faults = (
+        Fault("garbage", count=60),
+        Fault("garbage", at_s=0.02, count=600),  # more than one row holds
+        Fault("half_line", at_s=0.04, length_count=12),
+        Fault("sensor_silence", at_s=0.06, duration_s=0.003),
+        Fault("duplicate_frame", at_s=0.08, can_id=MACRO_TPDO, duration_s=0.01),
+        Fault("delay_frame", at_s=0.10, can_id=MACRO_TPDO, delay_s=1.5e-3, duration_s=0.01),
+        Fault("drop_frame", at_s=0.12, can_id=MICRO_RPDO, count=1),
+        Fault("drop_frame", at_s=0.14, can_id=SYNC, count=1),
+    )
+
+    def strike(stage, backend):
+        hold_the_host_up(0.010)(stage, backend)
+        inject(*faults)(stage, backend)
+
+    seen = struck(tmp_path / "run", oled_profile, oled_machine, strike)
+    assert seen.outcome.stop is Stop.FINISHED
+    rows = seen.run.rows
+    assert rows["samples_lost"][-1] == 1 + 3
+    assert rows["cycles_missed"][-1] == 9
+    end = seen.run.manifest["end"]
+    assert (end["lost_samples"], end["discarded_bytes"], end["missed_cycles"]) == (4, 60 + 600 + 12, 9)
+    assert rows["sensor_bytes_count"].max() == SENSOR_BYTES_COUNT
+    assert rows.size == seen.rows_written
+    assert np.abs(seen.relative_m).max() < 0.4e-3
+    assert seen.replays() == ""
+
+
+# ---- what does ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault at speed and how the run must end."""
+
+    strike: Strike
+    stop: Stop
+    text: str  # a pattern: what, where, value, limit
+    guided: bool = False  # the micro must stay off its hard stops
+    profile: dict | None = None
+
+
+def drop(*can_ids: int) -> Strike:
+    """Lose frames for 0.3 s; the run must not go on afterwards."""
+    return inject(*(Fault("drop_frame", can_id=can_id, duration_s=0.3) for can_id in can_ids))
+
+
+def flood(stage, backend):
+    """Another node talks without end, with a better id than anybody's."""
+    for _ in range(600):
+        backend.wire.bus.submit(1, backend.wire.t_ns, 0x001, bytes(8))
+
+
+def fall_silent(stage, backend):
+    """The supervisor publishes nothing for a while."""
+    stage.link.pass_time(0.8)
+
+
+def let_the_lease_go(stage, backend):
+    """Renew the lease no more."""
+    stage._holds_lease = False
+
+
+def jump(stage, backend):
+    """The reference leaps by a millimetre."""
+    stage.link.segments["position_m"][:] += 1e-3
+
+
+def leave_the_stroke(stage, backend):
+    """The reference sends the micro against its stops, at its leisure: the following error stays small."""
+    rows = stage.link.segments
+    left = slice(int(stage.status()["segment_left_rows"]) * -1 + stage._segment_free, stage._segment_free)
+    count = rows[left].size
+    rows["relative_position_m"][left] = np.linspace(0.0, -3e-3, count)
+
+
+def believe_nan(stage, backend):
+    """A belief without a number reaches the law."""
+    stage._belief["micro_mass_kg"] = math.nan
+    decoder = backend.servo.decoder
+    stage._publish_update(decoder.macro_zero_counts, decoder.end_zero_counts)
+
+
+CASES = {
+    "end beam": Case(inject(Fault("beam_loss", axis="end")), Stop.REFERENCE_LOST, "no beam on end"),
+    "macro beam": Case(inject(Fault("beam_loss", axis="macro")), Stop.REFERENCE_LOST, "no beam on macro"),
+    "stuck counts": Case(
+        inject(Fault("stuck_counts")), Stop.REFERENCE_LOST, r"macro counts are stuck: .* moved \d+ um .* limit 50 um"
+    ),
+    "sensor restart": Case(inject(Fault("sensor_restart")), Stop.REFERENCE_LOST, "restarted: its numbers went back"),
+    "sequence gap": Case(
+        inject(Fault("sequence_gap", count=2)), Stop.REFERENCE_LOST, r"jumped ahead by 2: sample \d+ came 1\.\d ms"
+    ),
+    "silence": Case(
+        inject(Fault("sensor_silence")), Stop.SENSOR_AGE, r"newest sample \d+ is 20\.\d ms old, limit 20 ms; check"
+    ),
+    "noise instead of lines": Case(
+        inject(*(Fault("half_line", at_s=0.001 * k, length_count=20) for k in range(40))),
+        Stop.SENSOR_AGE,
+        r"newest sample \d+ is 20\.\d ms old",
+    ),
+    "unplugged": Case(inject(Fault("unplug")), Stop.LINK_LOST, r"port is gone \(unplugged\); plug it in, then home"),
+    "CAN silent": Case(
+        drop(*EVERY_FRAME), Stop.LINK_SILENT, r"macro \(node 1\): nothing for 21 cycles, limit 20; micro \(node 2\)"
+    ),
+    "macro silent": Case(drop(MACRO_TPDO), Stop.LINK_SILENT, r"macro \(node 1\): nothing for 21 cycles", guided=True),
+    "micro silent": Case(drop(MICRO_TPDO), Stop.LINK_SILENT, r"micro \(node 2\): nothing for 21 cycles, limit 20;"),
+    "bus-off": Case(inject(Fault("bus_off", duration_s=0.3)), Stop.LINK_LOST, "bus-off: check cable"),
+    "short PDO": Case(
+        inject(Fault("short_frame", can_id=MACRO_TPDO, length_count=4, duration_s=0.3)),
+        Stop.LINK_LOST,
+        r"macro \(node 1\): PDO of 4 bytes, .* needs 8; .* arm again",
+    ),
+    "short EMCY": Case(
+        inject(
+            Fault("short_frame", can_id=0x082, length_count=1),
+            Fault("emergency", node_id=MICRO, code=ENCODER_FAULT),
+        ),
+        Stop.LINK_LOST,
+        "emergency message of 1 bytes",
+    ),
+    "micro EMCY": Case(
+        inject(Fault("emergency", node_id=MICRO, code=ENCODER_FAULT)), Stop.EMERGENCY, "node 2: EMCY 0x7305 encoder 1"
+    ),
+    "limit switch": Case(
+        inject(Fault("input", node_id=MACRO, bits=POSITIVE_LIMIT)),
+        Stop.DIGITAL_INPUT,
+        r"macro \(node 1\): positive limit switch \(0x60FD = 0x2\)",
+        guided=True,
+    ),
+    "pressure": Case(
+        inject(Fault("input", node_id=MACRO, bits=PRESSURE)), Stop.DIGITAL_INPUT, "pressure low", guided=True
+    ),
+    "STO of the micro": Case(inject(Fault("input", node_id=MICRO, bits=STO)), Stop.DIGITAL_INPUT, r"micro .*: STO"),
+    "heartbeat": Case(
+        inject(Fault("heartbeat_silence", node_id=MACRO)),
+        Stop.HEARTBEAT_LOST,
+        r"macro \(node 1\): \d+ ms ago, limit 200 ms",
+        guided=True,
+    ),
+    "full queue": Case(flood, Stop.COMMAND_LOST, r"\d+ frames were refused so far"),
+    "host held up": Case(hold_the_host_up(0.03), Stop.OVERRUN, r"began 29\.\d ms late, limit 20 ms"),
+    "supervisor silent": Case(fall_silent, Stop.SUPERVISOR_SILENT, r"for 0\.50\d s, limit 0\.5 s", guided=True),
+    "lease": Case(let_the_lease_go, Stop.LEASE, r"it ended \d+\.\d ms ago", guided=True),
+    "nan": Case(believe_nan, Stop.COMMAND_NOT_FINITE, "dsmc asked nan N of the macro, nan N of the micro"),
+    "nan in position mode": Case(
+        believe_nan, Stop.COMMAND_NOT_FINITE, "dsmc asked", profile={"macro__mode": "position"}
+    ),
+    "following error": Case(
+        jump, Stop.FOLLOWING_ERROR, r"end -1000\.\d um from its reference at 0\.\d+ m, limit 200 um", guided=True
+    ),
+    "micro stroke": Case(
+        leave_the_stroke, Stop.MICRO_STROKE, r"end minus macro -?0\.95\d* mm, allowed -0\.95 .. 0\.95"
+    ),
+    "too fast for the way left": Case(
+        inject(),
+        Stop.VELOCITY,
+        r"macro at 0\.0\d+ m with 0\.\d+ m/s would come to rest at 0\.0[67]\d+ m, travel ends at 0\.07 m",
+        guided=True,
+        profile={"macro__travel_m": (-0.05, 0.07)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_fault_at_speed_ends_the_run_and_the_stage_rests(name, tmp_path, oled_profile, oled_machine):
+    """The reason with its numbers, the macro at rest, no drive left enabled, every row kept, every row replayed."""
+    case = CASES[name]
+    seen = struck(tmp_path / "run", with_values(oled_profile, **(case.profile or {})), oled_machine, case.strike)
+    assert seen.outcome.stop is case.stop, seen.outcome.text
+    assert re.search(case.text, seen.outcome.detail), seen.outcome.detail
+    assert seen.outcome.text.startswith(STOP_TEXT[case.stop])
+    assert seen.rest_velocity_m_per_s < REST_M_PER_S
+    assert "OPERATION_ENABLED" not in seen.drive_states
+    if case.guided:
+        assert np.abs(seen.relative_m).max() < 0.5 * HARD_STOP_M
+    rows = seen.run.rows
+    assert rows.size == seen.rows_written
+    assert not seen.run.truncated
+    assert seen.run.manifest["end"]["stop"] == case.stop.name
+    assert case.stop.name in [event.get("stop") for event in seen.run.events]
+    assert not np.isin(rows["run_phase"][-200:], (Phase.TRACKING, Phase.ENABLING)).any()  # nothing came back by itself
+    assert seen.replays() == ""
+
+
+def test_a_micro_that_can_be_trusted_stops_gently_whatever_braked_the_macro(tmp_path, oled_profile, oled_machine):
+    """The macro's drive reports a fault and ramps down by itself; only then it loses its power, and may drift."""
+    strike = inject(Fault("emergency", node_id=MACRO, code=ENCODER_FAULT))
+    seen = struck(tmp_path / "run", oled_profile, oled_machine, strike)
+    assert seen.outcome.stop is Stop.EMERGENCY
+    assert "node 1: EMCY 0x7305 encoder 1" in seen.outcome.detail
+    after = seen.truth["t_ns"] >= seen.struck_t_ns
+    assert np.abs(seen.truth["macro_velocity_m_per_s"][after]).min() < REST_M_PER_S
+    assert np.abs(seen.relative_m).max() < 0.5 * HARD_STOP_M
+    assert [event["code"] for event in seen.run.events if event["event"] == "emergency"] == [ENCODER_FAULT]
+    assert seen.replays() == ""
+
+
+def test_an_axis_without_torque_is_said_to_coast(tmp_path, oled_profile, oled_machine):
+    """After STO nothing brakes the macro: the micro stays on it as long as it can, and the text warns."""
+    seen = struck(tmp_path / "run", oled_profile, oled_machine, inject(Fault("input", node_id=MACRO, bits=STO)))
+    assert seen.outcome.stop is Stop.DIGITAL_INPUT
+    assert re.search(r"macro \(node 1\): STO .* was not seen to stand within 5 s: keep clear", seen.outcome.detail)
+    assert np.abs(seen.relative_m[:1500]).max() < 0.5 * HARD_STOP_M
+    assert seen.replays() == ""
+
+
+def test_a_second_fault_during_a_guided_stop_is_told_too(tmp_path, oled_profile, oled_machine):
+    def strike(stage, backend):
+        jump(stage, backend)
+        inject(Fault("beam_loss", at_s=0.03, axis="end"))(stage, backend)
+
+    seen = struck(tmp_path / "run", oled_profile, oled_machine, strike)
+    assert seen.outcome.stop is Stop.FOLLOWING_ERROR
+    assert seen.outcome.detail.endswith("; then no beam on end")
+    assert seen.rest_velocity_m_per_s < REST_M_PER_S
+    assert {Phase.GUIDED_STOP, Phase.QUICK_STOP} <= set(seen.run.rows["run_phase"])
+    assert seen.replays() == ""
+
+
+def test_a_law_that_asks_for_too_much_is_cut_off(tmp_path, oled_profile, oled_machine):
+    """A law whose own limit is gone; what was put into its memory is in no record, so the replay ends there."""
+
+    def strike(stage, backend):
+        law = backend.servo.tracker.active.law
+        law["precision_force_limit_n"], law["error_integral_m_s"] = 1e6, 1.0
+
+    seen = struck(tmp_path / "run", oled_profile, oled_machine, strike)
+    assert seen.outcome.stop is Stop.FORCE
+    assert re.search(r"asked -1000000\.0 N of the micro, limit 180 N", seen.outcome.detail)
+    assert seen.rest_velocity_m_per_s < REST_M_PER_S
+    row = seen.first_stop_row
+    assert seen.run.rows["micro_word"][row] == 0
+    assert seen.replays(row) == ""
+
+
+def test_one_axis_stops_when_its_sensor_falls_silent(tmp_path, single_profile, single_machine):
+    one = Stage(tmp_path / "run", single_profile, single_machine)
+    with one:
+        assert one.stage.enable() is Stop.NONE
+        inject(Fault("sensor_silence", at_s=0.35))(one.stage, one.backend)
+        outcome = one.stage.move(float(one.stage.status()["setpoint_position_m"]) + 0.05)
+        assert outcome.stop is Stop.SENSOR_AGE
+        assert abs(one.plant["macro_velocity_m_per_s"]) < REST_M_PER_S
+    assert replay(tmp_path / "run").exact
+
+
+# ---- the run's disk, and the person at the keyboard --------------------------------------------------------------
+
+
+def arm_and_move(one: Stage, strike: Strike) -> None:
+    """Open, arm, move, strike; whatever that raises leaves a closed stage."""
+    with one:
+        assert one.arm() is Stop.NONE
+        one.move(strike)
+
+
+def speed_when_stopped(one: Stage, run) -> float:
+    """Return the macro's true speed when the servo said that it stands; without power it may drift afterwards."""
+    stopped_t_ns = run.rows["t_ns"][run.rows["run_phase"] == Phase.STOPPED][0]
+    truth = one.backend.truth()
+    return abs(truth["macro_velocity_m_per_s"][np.searchsorted(truth["t_ns"], stopped_t_ns)])
+
+
+def test_a_full_disk_stops_the_stage_and_leaves_a_readable_run(tmp_path, oled_profile, oled_machine):
+    """What was written stays, what comes until the stage rests still fits, and the error says what to do."""
+    with small_disk(tmp_path / "disk", 24 << 20) as disk:
+        filler = disk / "filler"
+
+        def strike(stage, backend):
+            stage.recorder.flush()
+            with filler.open("wb") as file, contextlib.suppress(OSError):
+                while True:
+                    file.write(bytes(1 << 16))
+
+        one = Stage(disk / "run", oled_profile, oled_machine)
+        with pytest.raises(RecordError, match=r"No space left .* held in memory; end the run, free space"):
+            arm_and_move(one, strike)
+        run = read_run(disk / "run")
+        assert speed_when_stopped(one, run) < REST_M_PER_S
+        assert "OPERATION_ENABLED" not in one.drive_states
+        assert run.rows.size == one.backend.servo.ring.written_count
+        assert run.manifest["end"]["stop"] == "RECORD_LOST"
+        assert replay(disk / "run").exact
+
+
+def test_ctrl_c_brings_the_stage_to_rest_and_closes_the_run(tmp_path, oled_profile, oled_machine):
+    def strike(stage, backend):
+        raise KeyboardInterrupt
+
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with pytest.raises(KeyboardInterrupt):
+        arm_and_move(one, strike)
+    run = read_run(tmp_path / "run")
+    assert speed_when_stopped(one, run) < REST_M_PER_S
+    assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+    assert run.rows.size == one.backend.servo.ring.written_count
+    assert not run.truncated
+    assert replay(tmp_path / "run").exact
+
+
+def test_closing_takes_the_power_away_even_after_a_fault(tmp_path, oled_profile, oled_machine):
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        one.arm()
+        assert one.move(jump).stop is Stop.FOLLOWING_ERROR
+        assert one.drive_states == ("QUICK_STOP_ACTIVE", "SWITCH_ON_DISABLED")  # held until somebody decides
+    assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+
+
+# ---- arming --------------------------------------------------------------------------------------------------------
+
+
+def test_a_lost_reference_needs_a_homing(tmp_path, oled_profile, oled_machine):
+    """Acknowledging is not enough, and nothing is powered before somebody has homed."""
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        one.arm()
+        assert one.move(inject(Fault("beam_loss", axis="end", duration_s=0.2))).stop is Stop.REFERENCE_LOST
+        assert one.stage.acknowledge() is Stop.NONE
+        one.stage.pump(0.5)
+        assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+        powered_before = one.backend.servo.ring.written_count
+        assert one.stage.enable() is Stop.REFERENCE_LOST
+        assert one.stage.detail == "no beam on end"
+        one.stage.acknowledge()
+        assert one.stage.home().finished
+        assert one.arm() is Stop.NONE
+        assert one.move().finished
+    run = read_run(tmp_path / "run")
+    refused = run.rows[powered_before : powered_before + 40]
+    assert not np.isin(refused["run_phase"], (Phase.ENABLING, Phase.TRACKING)).any()
+    assert replay(tmp_path / "run").exact
+
+
+def test_a_drive_in_fault_is_reset_by_an_acknowledgement_and_by_nothing_else(tmp_path, oled_profile, oled_machine):
+    """Both drives in fault at once; enabling is refused before, works after, and never happens by itself."""
+    both = inject(*(Fault("emergency", node_id=node_id, code=ENCODER_FAULT) for node_id in (MACRO, MICRO)))
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        one.arm()
+        assert one.move(both).stop is Stop.EMERGENCY
+        one.stage.pump(1.0)
+        assert one.drive_states == ("FAULT", "FAULT")
+        assert one.stage.enable() is Stop.EMERGENCY
+        assert one.drive_states == ("FAULT", "FAULT")
+        assert one.stage.acknowledge() is Stop.NONE
+        one.stage.pump(0.5)
+        assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+        assert one.stage.status()["phase"] == Phase.IDLE
+        assert one.arm() is Stop.NONE
+        assert one.move().finished
+    assert replay(tmp_path / "run").exact
+
+
+def test_an_open_interlock_refuses_power(tmp_path, oled_profile, oled_machine):
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        inject(Fault("input", node_id=MACRO, bits=PRESSURE, duration_s=0.2))(one.stage, one.backend)
+        one.stage.pump(0.05)
+        assert one.stage.enable() is Stop.DIGITAL_INPUT
+        assert "pressure low" in one.stage.detail
+        assert one.stage.home().stop is Stop.DIGITAL_INPUT
+        one.stage.pump(0.3)
+        assert one.stage.enable() is Stop.DIGITAL_INPUT  # the cause is gone, the fault is not acknowledged
+        assert one.stage.acknowledge() is Stop.NONE
+        assert one.stage.enable() is Stop.NONE
+
+
+def test_a_failed_port_stops_every_further_try(tmp_path, oled_profile, oled_machine):
+    """A port that came back is not used again: arm anew."""
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        inject(Fault("unplug", duration_s=0.1))(one.stage, one.backend)
+        one.stage.pump(0.3)
+        assert one.stage.enable() is Stop.LINK_LOST
+        assert one.stage.acknowledge() is Stop.LINK_LOST
+        assert "unplugged" in one.stage.detail
+        assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+
+
+def test_a_missing_heartbeat_refuses_to_enable(tmp_path, oled_profile, oled_machine):
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        inject(Fault("heartbeat_silence", node_id=MICRO, duration_s=0.5))(one.stage, one.backend)
+        one.stage.pump(0.3)
+        one.stage.pump()
+        assert one.stage.enable() is Stop.HEARTBEAT_LOST
+        one.stage.pump(0.4)
+        one.stage.pump()
+        assert one.stage.enable() is Stop.NONE
+    said = [event["event"] for event in read_run(tmp_path / "run").events]
+    assert said.count("heartbeat_lost") == said.count("heartbeat_back") == 1
+
+
+def test_a_stage_outside_its_travel_is_not_moved(tmp_path, oled_profile, oled_machine):
+    profile = with_values(oled_profile, macro__travel_m=(0.1, 0.4))
+    one = Stage(tmp_path / "run", profile, oled_machine)
+    with one:
+        assert one.stage.enable() is Stop.TRAVEL
+        assert re.search(r"macro at 0\.01\d+ m, travel 0\.1 \.\. 0\.4 m; move it back", one.stage.detail)
+    assert replay(tmp_path / "run").exact
+
+
+def test_a_belief_that_is_none_is_refused(tmp_path, oled_profile, oled_machine):
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one, pytest.raises(RequestError, match=r"must be finite, width and stiffness above 0"):
+        one.stage.take_backlash(BacklashEstimate(2e-5, math.nan, 1e-8, 1e-8, 1e4, 1e4, 1.0, 1.0))
+
+
+def arm(profile, backend, folder) -> None:
+    """Configure the drives and let go again."""
+    with Supervisor(profile, backend, folder):
+        pass
+
+
+def test_drives_of_another_world_are_not_armed(tmp_path, oled_profile, oled_machine):
+    backend = BatchBackend(oled_machine, seed=SEED)
+    backend.vendor_id = None  # as hardware: the profile's own vendor
+    with pytest.raises(DriveError, match=r"node 1: 0x1018:01 vendor id: wanted 0x539, read 0x5254; .* correct"):
+        arm(oled_profile, backend, tmp_path / "run")
+
+
+class ForgetfulBus(can.BusABC):
+    """A bus on which one drive stores something else than it was told: the value of one SDO download is changed."""
+
+    def __init__(self, bus: can.BusABC, command: bytes, value: bytes) -> None:
+        super().__init__(channel="forgetful")
+        self.channel_info = "forgetful"
+        self._inner, self._command, self._value = bus, command, value
+
+    def attach(self, on_frame) -> None:
+        self._inner.attach(on_frame)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        data = bytes(msg.data)
+        if data.startswith(self._command):
+            data = self._command + self._value
+        self._inner.send(can.Message(arbitration_id=msg.arbitration_id, is_extended_id=False, data=data), timeout)
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self._inner.shutdown()
+
+
+def test_a_mapping_that_differs_is_not_armed(tmp_path, oled_profile, oled_machine):
+    """TPDO1's second entry, 0x6064 with 32 bits, is stored as 0x60FD: both exist, only reading back tells."""
+    backend = BatchBackend(oled_machine, seed=SEED)
+    told = bytes([0x23, 0x00, 0x1A, 0x02])  # SDO download of four bytes to 0x1A00:02
+    stored = bytes([0x20, 0x00, 0xFD, 0x60])
+    bus = ForgetfulBus(backend.network_bus(), told, stored)
+    backend.network_bus = lambda: bus
+    pattern = r"node 1: 0x1A00:02 mapped object 2: wrote \d+ \(0x60640020\), read \d+ \(0x60FD0020\)"
+    with pytest.raises(DriveError, match=pattern):
+        arm(oled_profile, backend, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("fault", "pattern"),
+    [
+        (Fault("sensor_silence"), r"no steady valid samples within 5 s: nothing came; check its power and cable"),
+        (Fault("beam_loss", axis="both"), r"\d+ bytes came in the last second, no valid sample; check beams"),
+        (Fault("unplug"), r"port is gone \(unplugged\)"),
+    ],
+    ids=lambda value: value.kind if isinstance(value, Fault) else "",
+)
+def test_an_interferometer_that_says_nothing_is_not_armed(fault, pattern, tmp_path, oled_profile, oled_machine):
+    backend = BatchBackend(oled_machine, seed=SEED, faults=(fault,))
+    with pytest.raises(LinkError, match=pattern), Supervisor(oled_profile, backend, tmp_path / "run"):
+        pass
+    assert not read_run(tmp_path / "run").truncated
+
+
+# ---- small parts ---------------------------------------------------------------------------------------------------
+
+
+def test_an_emergency_is_not_hidden_by_its_own_reset():
+    """Both arrive in one cycle: the loop must still see that there was one."""
+    inbox = Inbox()
+    raised, reset = bytes([0x05, 0x73, 0x01, 0, 0, 0, 0, 0]), bytes(8)
+    inbox.take("macro_emcy", raised)
+    inbox.take("macro_emcy", reset)
+    assert cia402.decode_emergency(inbox.macro_emcy)[0] == ENCODER_FAULT
+    inbox.clear()
+    inbox.take("macro_emcy", reset)
+    assert inbox.macro_emcy == reset
