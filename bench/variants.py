@@ -1,10 +1,14 @@
 """Profiles and machines with single values changed, for what a figure asks."""
 
+from typing import TypeVar
+
 from sim_backend.machine import Machine
 from stagectl.profile import Profile
 
+Described = TypeVar("Described", Profile, Machine)
 
-def with_noise(described: Profile | Machine, noise_m: float):
+
+def with_noise(described: Described, noise_m: float) -> Described:
     """Copy a profile or machine with another noise of the interferometer, m rms."""
     sensor = described.interferometer.model_copy(update={"noise_m": noise_m})
     return described.model_copy(update={"interferometer": sensor})

@@ -55,6 +55,7 @@ class RigProcess:
         self._delayed: list[tuple[int, int, int, bytes, int]] = []  # instant, number, id, payload, sender
         self._delayed_count = 0
         self._bus_was_off = False
+        self._held_up_ns = 0  # by the host, altogether: by so much the drives noticed silence later
         self.rig.take_frames()  # boot-up: nobody is on the bus yet
 
     # -- loop ---------------------------------------------------------------------------------------------------------
@@ -81,6 +82,7 @@ class RigProcess:
             served_t_ns = woken_t_ns
             if late_ns > _HELD_UP_NS:  # a real drive is not held up by the host: this is no silence of its master
                 self.rig.postpone_watches(late_ns)
+                self._held_up_ns += late_ns
             for fileno in ready:
                 for sender, can_id, payload in self.hub.read(fileno):
                     self._pass(can_id, payload, sender)
@@ -171,6 +173,7 @@ class RigProcess:
             "plant": rig.plant_state(),
             "drives": {str(node.node_id): node.drive.state.name for node in rig.nodes},
             "lines_lost_count": self.port.lines_lost_count,
+            "held_up_ns": self._held_up_ns,
         }
 
     def close(self) -> None:

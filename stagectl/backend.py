@@ -64,8 +64,12 @@ class Backend(Protocol):
     """A world that a supervisor can work in."""
 
     name: str
-    vendor_id: int | None  # that every node must show; None = the profile's
     description: str
+
+    @property
+    def vendor_id(self) -> int | None:
+        """Vendor id that every node must show; None = the profile's."""
+        ...
 
     def network_bus(self) -> can.BusABC:
         """Return the bus of the master."""
@@ -268,7 +272,7 @@ class _Child:
     def hear(self, timeout_s: float) -> dict:
         """Return the next line; LinkError on silence, end or a reported error."""
         stdout = self.process.stdout
-        ready, _, _ = select.select([stdout], [], [], timeout_s)
+        ready = stdout is not None and select.select([stdout], [], [], timeout_s)[0]
         line = stdout.readline() if ready and stdout is not None else ""
         if not line:
             raise LinkError(f"the {self.name} process said nothing within {timeout_s:g} s ({self._end()})")
@@ -304,6 +308,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 _KINDS = {kind.__name__: kind for kind in (DriveError, LinkError, ProfileError, RecordError, TimingError)}
 _WARM_TIMEOUT_S = 180.0  # a cold compile cache on a slow host
 _SERVO_START_TIMEOUT_S = 30.0
+_RIG_ANSWER_S = 5.0
 
 
 class RealtimeBackend:
@@ -419,6 +424,20 @@ class HardwareBackend(RealtimeBackend):
         )
 
 
+def ask_rig(channel: str, message: dict) -> dict:
+    """Send a request to the rig process behind a hub's socket and return its answer."""
+    asked = connect_hub(channel)
+    try:
+        asked.settimeout(_RIG_ANSWER_S)
+        asked.send(b"FILT")
+        asked.send(b"RIG " + json.dumps(message).encode())
+        while not (answer := asked.recv(1 << 16)).startswith(b"RIG "):
+            pass  # frames that were under way before the filter took effect
+    finally:
+        asked.close()
+    return json.loads(answer.removeprefix(b"RIG "))
+
+
 class RigBackend(RealtimeBackend):
     """The software rig in a process of its own: the same bytes, in real time."""
 
@@ -436,22 +455,18 @@ class RigBackend(RealtimeBackend):
         self.description = f"software rig {Path(machine).stem}, real time, seed {seed}"
 
     @property
+    def channel(self) -> str:
+        """Path of the hub's socket."""
+        return self._channel
+
+    @property
     def rig_pid(self) -> int:
         """Process id of the rig."""
         return self._rig.process.pid
 
     def request(self, message: dict) -> dict:
         """Ask the rig process something: {"fault": ...}, {"truth": path}, {"state": true}."""
-        asked = connect_hub(self._channel)
-        try:
-            asked.settimeout(5.0)
-            asked.send(b"FILT")
-            asked.send(b"RIG " + json.dumps(message).encode())
-            while not (answer := asked.recv(1 << 16)).startswith(b"RIG "):
-                pass  # frames that were under way before the filter took effect
-        finally:
-            asked.close()
-        return json.loads(answer.removeprefix(b"RIG "))
+        return ask_rig(self._channel, message)
 
     def truth(self) -> dict[str, np.ndarray] | None:
         """Return the rig's log so far."""

@@ -7,7 +7,7 @@ block and the ring. No SDO, no files, no logging here.
 
 import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -63,9 +63,13 @@ _LENGTHS = tuple(count.to_bytes(8, "little") for count in range(FRAME_BYTES_COUN
 class Transport(Protocol):
     """Bus, serial line and clock of one world."""
 
-    lost_count: int
     failure: str
     """What is wrong with bus or port for good, empty while both work."""
+
+    @property
+    def lost_count(self) -> int:
+        """Frames that the bus did not take."""
+        ...
 
     def now_t_ns(self) -> int:
         """Return the time of this world's clock."""
@@ -102,9 +106,9 @@ class Servo:
         self._clock_ns = clock_ns
         self.inbox = Inbox()
         self.row = new_rows(1)
-        self._row_bytes = memoryview(self.row).cast("B")
+        self._row_bytes = memoryview(self.row).cast("B")  # pyright: ignore[reportArgumentType]
         self._fresh_bytes = new_rows(1).tobytes()
-        fields = ROW.fields or {}
+        fields: Any = ROW.fields  # its keys are typed as literals
         self._offsets = {name: fields[name][1] for name in ROW.names or ()}
         self._homing_id = 0
         self._stated_text = ""

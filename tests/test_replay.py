@@ -1,0 +1,94 @@
+"""Replay: bit for bit from the raw bytes, for every law on every machine, and it notices what was changed."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from bench import replaying
+from stagectl.errors import RecordError
+from stagectl.record import Recorder, Run, read_run
+from stagectl.replay import replay, replay_run
+from stagectl.row import new_rows
+from stagectl.tracker import LAW_NAMES
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A run of the machine with one axis: homing, both laws, stops."""
+    return replaying.record("single-axis", 3, tmp_path_factory.mktemp("replay") / "single-axis")
+
+
+@pytest.mark.parametrize("name", replaying.MACHINES)
+def test_every_law_on_every_machine_bit_for_bit(name, tmp_path):
+    found = replaying.replayed(name, 2, tmp_path / name)
+    assert found.differing_rows == 0, found.first_difference
+    assert set(found.ticks) == set(LAW_NAMES)
+    for law, ticks in found.ticks.items():
+        assert ticks > 300, f"{law} hardly moved"
+
+
+def changed(run: Run, name: str, row: int, byte: int, bit: int) -> Run:
+    """Copy a run with one bit of one recorded byte flipped."""
+    rows = run.rows.copy()
+    rows[name][row, byte] ^= 1 << bit
+    return dataclasses.replace(run, rows=rows)
+
+
+def moving_row(run: Run, wanted: str) -> int:
+    """Return a row in the midst of motion in which `wanted` holds bytes."""
+    there = (run.rows["setpoint_velocity_m_per_s"] != 0.0) & (run.rows[wanted] > 0)
+    rows = np.flatnonzero(there)
+    return int(rows[rows.size // 2])
+
+
+@pytest.mark.parametrize("byte", [0, 3, 6, 13, 22, 24])
+def test_a_flipped_bit_in_a_sensor_byte_is_noticed(recorded, byte):
+    """Sync, sequence, both ends of the count, status, checksum: each makes another sample, or none, of the line."""
+    row = moving_row(recorded, "sensor_bytes_count")
+    found = replay_run(changed(recorded, "sensor_bytes", row, byte, 0))
+    assert not found.exact
+    assert found.first_difference.startswith(f"row {row},")
+
+
+def test_a_flipped_bit_in_a_drive_s_position_is_noticed(recorded):
+    row = moving_row(recorded, "macro_tpdo_count")
+    found = replay_run(changed(recorded, "macro_tpdo", row, 2, 0))
+    assert found.first_difference.startswith(f"row {row},")
+    assert "macro_encoder_m" in found.first_difference
+
+
+def test_another_setpoint_gives_another_command(recorded):
+    row = moving_row(recorded, "sensor_bytes_count")
+    rows = recorded.rows.copy()
+    rows["setpoint_position_m"][row] += 1e-9
+    found = replay_run(dataclasses.replace(recorded, rows=rows))
+    assert not found.exact
+    assert found.greatest_force_difference_n > 0.0
+
+
+def test_a_change_without_its_event_is_refused(recorded):
+    events = [event for event in recorded.events if event.get("event") != "update"]
+    with pytest.raises(RecordError, match=r"update 1 has no event; events\.jsonl is incomplete"):
+        replay_run(dataclasses.replace(recorded, events=events))
+
+
+def test_a_run_without_bytes_is_refused(tmp_path):
+    folder = tmp_path / "table"
+    with Recorder(folder, {"name": "table", "backend": "import"}) as recorder:
+        rows = new_rows(3)
+        rows["t_ns"] = [1, 2, 3]
+        recorder.append(rows)
+    with pytest.raises(RecordError, match="no raw bytes to start from"):
+        replay(folder)
+
+
+def test_a_run_without_its_snapshot_is_refused(recorded):
+    with pytest.raises(RecordError, match="nothing to replay"):
+        replay_run(dataclasses.replace(recorded, snapshot=None))
+
+
+def test_a_run_read_twice_replays_alike(recorded):
+    again = read_run(recorded.folder)
+    assert replay_run(again) == replay_run(recorded)
+    assert replay_run(again).exact
