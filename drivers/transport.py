@@ -79,7 +79,9 @@ class RealtimeTransport:
             self.error_frames_count += 1
             self.failure = error_frame_text(can_id) or self.failure
             return
-        inbox.take(self._names[can_id], payload)
+        name = self._names.get(can_id)
+        if name is not None:  # a filter takes effect a moment after the bus is open
+            inbox.take(name, payload)
 
     def _read(self, inbox: Inbox) -> None:
         inbox.sensor_arrival_t_ns = now_t_ns()

@@ -24,6 +24,8 @@ HEARTBEAT_FRAME = (0x700 + SERVO_NODE_ID, b"\x05")
 SYNC_FRAME = (SYNC_ID, b"")
 
 BOTH_VALID = MACRO_VALID | END_VALID
+_SILENCE_CODES = (0x81, 0x82, 0x87)  # communication, protocol, SYNC: without power only "nobody talked to me"
+_POWERED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia402.State.FAULT_REACTION_ACTIVE)
 _NO_ERROR = b"\0\0"  # an EMCY that takes the one before back
 _DISAGREEMENTS_IN_A_ROW = 5  # a host that holds a SYNC up by a millisecond is no lost reference
 _CLOCK_SAMPLES = 200  # before the sample clock can tell that a number came too early
@@ -202,7 +204,9 @@ class WireDecoder:
             payload = inbox.macro_emcy if bit == 1 else inbox.micro_emcy
             if payload is not None:
                 code = cia402.decode_emergency(payload)[0]
-                m["emergency"][0] = node_id << 16 | code if code else 0
+                powered = cia402.state_of(int(m[f"{axis}_statusword"][0])) in _POWERED
+                if powered or code >> 8 not in _SILENCE_CODES:
+                    m["emergency"][0] = node_id << 16 | code if code else 0
         m["tpdos_new"][0] = fresh
 
     def decode(self, inbox: Inbox, m: np.ndarray) -> str:

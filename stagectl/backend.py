@@ -258,7 +258,13 @@ class _Child:
     def __init__(self, name: str, command: list[str]):
         self.name = name
         self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1, cwd=_ROOT
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+            cwd=_ROOT,
+            env=_CHILD_ENVIRONMENT,
         )
 
     def tell(self, message: dict) -> None:
@@ -304,6 +310,8 @@ class _Child:
             self.process.wait()
 
 
+# numpy's and numba's library pools would put idle threads beside the servo's only one.
+_CHILD_ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 _ROOT = Path(__file__).resolve().parent.parent
 _KINDS = {kind.__name__: kind for kind in (DriveError, LinkError, ProfileError, RecordError, TimingError)}
 _WARM_TIMEOUT_S = 180.0  # a cold compile cache on a slow host

@@ -315,6 +315,9 @@ class Supervisor:
         master.nmt(0, "start")
         self._request(mode=int(Mode.IDLE))
         self._event("connected", backend=self.backend.name, profile=profile.name)
+        for remark in self.backend.remarks:
+            self._event("remark", text=remark)
+            self._progress(remark, 0.0)
         self._await_sensor()
         self._watches = True
 

@@ -42,13 +42,14 @@ def opened(folder: Path, progress=lambda what, share: None) -> Supervisor:
     return Supervisor(profile, backend, folder, progress)
 
 
-def arm(stage: Supervisor) -> None:
-    """Home by truth, enable, bring the macro to the middle of the gap."""
+def arm(stage: Supervisor) -> bool:
+    """Home by truth, enable, bring the macro to the middle of the gap; False where the host's hiccups trip it."""
     stage.pump(0.2)
     home_by_truth(stage, stage.backend.request({"state": True})["plant"])
-    stop = stage.enable()
-    if not stop:
-        stage._centre(stage.status())
+    if stage.enable():
+        return False
+    stage._centre(stage.status())
+    return not stage.enable()
 
 
 def cross(stage: Supervisor) -> trajectories.Trajectory:
@@ -76,7 +77,9 @@ def main() -> int:
     try:
         with stage:
             say(ring=str(backend._paths["ring"]))
-            arm(stage)
+            if not arm(stage):
+                say(moving=False, why=stage.detail)
+                return 1
             try:
                 outcome = stage.follow(cross(stage).setpoints, "crossing")
                 say(ended=outcome.stop.name, text=outcome.text)

@@ -153,6 +153,7 @@ CASES = {
     ),
     "macro silent": Case(drop(MACRO_TPDO), Stop.LINK_SILENT, r"macro \(node 1\): nothing for 21 cycles", guided=True),
     "micro silent": Case(drop(MICRO_TPDO), Stop.LINK_SILENT, r"micro \(node 2\): nothing for 21 cycles, limit 20;"),
+    "SYNC lost": Case(drop(SYNC), Stop.EMERGENCY, r"node \d: EMCY 0x8700 synchronisation lost"),
     "bus-off": Case(inject(Fault("bus_off", duration_s=0.3)), Stop.LINK_LOST, "bus-off: check cable"),
     "short PDO": Case(
         inject(Fault("short_frame", can_id=MACRO_TPDO, length_count=4, duration_s=0.3)),
@@ -425,6 +426,18 @@ def test_a_failed_port_stops_every_further_try(tmp_path, oled_profile, oled_mach
         assert one.stage.acknowledge() is Stop.LINK_LOST
         assert "unplugged" in one.stage.detail
         assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+
+
+def test_a_host_that_was_slow_before_arming_does_not_hinder_it(tmp_path, oled_profile, oled_machine):
+    """Drives without power that missed SYNC say so; that is recorded, and no reason against arming."""
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        drop(SYNC)(one.stage, one.backend)
+        one.stage.pump(0.5)
+        assert one.stage.enable() is Stop.NONE
+    run = read_run(tmp_path / "run")
+    assert {event["code"] for event in run.events if event["event"] == "emergency"} == {0x8700}
+    assert replay(tmp_path / "run").exact
 
 
 def test_a_missing_heartbeat_refuses_to_enable(tmp_path, oled_profile, oled_machine):

@@ -1,0 +1,116 @@
+"""The servo's world in real time, on a hub and a pseudo-terminal: what is taken, kept, and gone for good."""
+
+import os
+import tty
+
+import pytest
+
+from drivers.can_bus import ERROR_FLAG, open_cyclic
+from drivers.serial_port import SerialPort
+from drivers.transport import CHUNK_LIMIT_BYTES, RealtimeTransport
+from drivers.wire import Inbox
+from sim_backend.hub import Hub
+
+TPDO, HEARTBEAT, BUS_OFF = 0x181, 0x701, ERROR_FLAG | 0x40
+MS = 1_000_000
+
+
+class World:
+    """A hub and a pty, with a transport on both."""
+
+    def __init__(self, path: str) -> None:
+        self.hub = Hub(path)
+        self.master, slave = os.openpty()
+        tty.setraw(slave)
+        self.port = SerialPort(os.ttyname(slave), 921_600.0)
+        os.close(slave)
+        self.transport = RealtimeTransport(open_cyclic("hub", path, [TPDO]), self.port, {TPDO: "macro_tpdo"})
+
+    def serve(self) -> None:
+        """Let the hub read what its clients sent."""
+        for fileno in self.hub.filenos():
+            self.hub.read(fileno)
+
+    def cycle(self) -> Inbox:
+        """Receive for a few milliseconds."""
+        inbox = Inbox()
+        self.transport.receive(self.transport.now_t_ns() + 3 * MS, inbox)
+        return inbox
+
+    def unplug(self) -> None:
+        """Take the interferometer's plug out."""
+        os.close(self.master)
+        self.master = -1
+
+    def close(self) -> None:
+        """Give everything back."""
+        self.transport.close()
+        self.hub.close()
+        if self.master >= 0:
+            os.close(self.master)
+
+
+@pytest.fixture
+def world(tmp_path):
+    made = World(str(tmp_path / "hub"))
+    yield made
+    made.close()
+
+
+def test_frames_before_the_filter_took_effect_are_left_alone(world):
+    """The hub hears of the filter a moment after the connection: until then everything comes."""
+    (listening,) = world.hub.filenos()
+    world.hub.read(listening)  # the client is in, its filter not yet read
+    world.hub.relay(HEARTBEAT, b"\x05")
+    world.hub.relay(TPDO, bytes(8))
+    inbox = world.cycle()
+    assert inbox.macro_tpdo == bytes(8)
+    assert world.transport.failure == ""
+
+
+def test_what_one_row_can_not_hold_comes_with_the_next_cycle(world):
+    data = bytes(range(256)) * 3
+    os.write(world.master, data)
+    first, second, third = world.cycle(), world.cycle(), world.cycle()
+    assert len(first.sensor_bytes) == CHUNK_LIMIT_BYTES
+    assert first.sensor_bytes + second.sensor_bytes == data
+    assert third.sensor_bytes == b""
+
+
+def test_a_port_that_is_unplugged_is_said_and_the_bus_goes_on(world):
+    world.serve()
+    world.unplug()
+    world.cycle()
+    assert "is gone" in world.transport.failure
+    assert "arm and home again" in world.transport.failure
+    world.serve()
+    world.hub.relay(TPDO, bytes(8))
+    assert world.cycle().macro_tpdo == bytes(8)
+    assert world.transport.send([(0x201, bytes(4))])[0]
+
+
+def test_bus_off_is_said(world):
+    world.serve()
+    world.serve()
+    world.hub.relay(BUS_OFF, bytes(8))
+    world.cycle()
+    assert world.transport.failure.startswith("CAN controller is bus-off: check cable")
+
+
+def test_other_error_frames_are_counted_only(world):
+    world.serve()
+    world.serve()
+    world.hub.relay(ERROR_FLAG | 0x4, bytes(8))
+    world.cycle()
+    assert world.transport.failure == ""
+    assert world.transport.error_frames_count == 1
+
+
+def test_a_bus_that_is_gone_is_said_when_receiving_and_when_sending(world):
+    world.serve()
+    world.hub.close()
+    assert world.transport.send([(0x201, bytes(4))])[0] is False
+    assert "arm again" in world.transport.failure
+    world.transport.failure = ""
+    world.cycle()
+    assert "closed" in world.transport.failure or "arm again" in world.transport.failure
