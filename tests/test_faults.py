@@ -122,11 +122,15 @@ def leave_the_stroke(stage, backend):
     rows["relative_position_m"][left] = np.linspace(0.0, -3e-3, count)
 
 
-def believe_nan(stage, backend):
-    """A belief without a number reaches the law."""
-    stage._belief["micro_mass_kg"] = math.nan
-    decoder = backend.servo.decoder
-    stage._publish_update(decoder.macro_zero_counts, decoder.end_zero_counts)
+def believe_nan(name: str) -> Strike:
+    """Let a belief without a number reach the law."""
+
+    def strike(stage, backend):
+        stage._belief[name] = math.nan
+        decoder = backend.servo.decoder
+        stage._publish_update(decoder.macro_zero_counts, decoder.end_zero_counts)
+
+    return strike
 
 
 CASES = {
@@ -191,9 +195,11 @@ CASES = {
     "host held up": Case(hold_the_host_up(0.03), Stop.OVERRUN, r"began 29\.\d ms late, limit 20 ms"),
     "supervisor silent": Case(fall_silent, Stop.SUPERVISOR_SILENT, r"for 0\.50\d s, limit 0\.5 s", guided=True),
     "lease": Case(let_the_lease_go, Stop.LEASE, r"it ended \d+\.\d ms ago", guided=True),
-    "nan": Case(believe_nan, Stop.COMMAND_NOT_FINITE, "dsmc asked nan N of the macro, nan N of the micro"),
+    "nan": Case(
+        believe_nan("micro_mass_kg"), Stop.COMMAND_NOT_FINITE, "dsmc asked nan N of the macro, nan N of the micro"
+    ),
     "nan in position mode": Case(
-        believe_nan, Stop.COMMAND_NOT_FINITE, "dsmc asked", profile={"macro__mode": "position"}
+        believe_nan("left_m"), Stop.COMMAND_NOT_FINITE, "dsmc asked", profile={"macro__mode": "position"}
     ),
     "following error": Case(
         jump, Stop.FOLLOWING_ERROR, r"end -1000\.\d um from its reference at 0\.\d+ m, limit 200 um", guided=True

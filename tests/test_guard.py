@@ -87,6 +87,19 @@ LIMITS = [
     ({}, {"micro_n": -math.inf}, Stop.COMMAND_NOT_FINITE),
     ({}, {"setpoint_position_m": math.nan}, Stop.FOLLOWING_ERROR),
     ({}, {"setpoint_velocity_m_per_s": math.nan}, Stop.VELOCITY),
+    ({"end_position_m": 200e-6}, {"end_position_m": 200.001e-6}, Stop.FOLLOWING_ERROR),
+    (
+        {"end_position_m": 0.001 * 0.95, "setpoint_position_m": 0.001 * 0.95},
+        {"end_position_m": 0.00095001, "setpoint_position_m": 0.00095001},
+        Stop.MICRO_STROKE,
+    ),
+    (
+        {"end_position_m": -0.001 * 0.95, "setpoint_position_m": -0.001 * 0.95},
+        {"end_position_m": -0.00095001, "setpoint_position_m": -0.00095001},
+        Stop.MICRO_STROKE,
+    ),
+    ({"setpoint_velocity_m_per_s": 0.5}, {"setpoint_velocity_m_per_s": 0.500001}, Stop.VELOCITY),
+    ({"setpoint_velocity_m_per_s": -0.5}, {"setpoint_velocity_m_per_s": -0.500001}, Stop.VELOCITY),
 ]
 
 
