@@ -2,7 +2,6 @@
 mapped object in the lowest bytes) and CiA 402 (objects, widths, signs)."""
 
 import pickle
-import time
 
 import pytest
 from hypothesis import given
@@ -126,16 +125,3 @@ def test_codec_crosses_to_another_process():
 def test_every_value_that_fits_survives(statusword, position, torque):
     codec = Codec.from_mapping(TPDO_ACTUAL)
     assert codec.decode(codec.encode(statusword, position, torque)) == (statusword, position, torque)
-
-
-def test_cost_per_call():
-    """Encode and decode stay below 2 us: the best of several short series, so that a busy host doesn't judge."""
-    tpdo, rpdo = Codec.from_mapping(TPDO_ACTUAL), Codec.from_mapping(RPDO_TORQUE)
-    payload, best_ns = bytes(8), float("inf")
-    for _ in range(20):
-        start_ns = time.perf_counter_ns()
-        for _ in range(500):
-            tpdo.decode(payload)
-            rpdo.encode(15, -123)
-        best_ns = min(best_ns, (time.perf_counter_ns() - start_ns) / 1000)
-    assert best_ns < 2000.0

@@ -336,17 +336,13 @@ def test_the_ring_names_its_run(ring_path):
     assert RingWriter(None, slots_count=8, dtype=SMALL).reader().run_folder is None
 
 
-def test_write_takes_less_than_5_us_and_keeps_nothing():
+def test_write_keeps_nothing():
     writer = RingWriter(None)
     row = new_rows()
     blocks_before = sys.getallocatedblocks()
-    durations_ns = np.zeros(5000, np.int64)
-    for index in range(len(durations_ns)):
-        begun_ns = time.perf_counter_ns()
+    for _ in range(5000):
         writer.write(row)
-        durations_ns[index] = time.perf_counter_ns() - begun_ns
     assert sys.getallocatedblocks() - blocks_before < 50
-    assert np.median(durations_ns) < 5000
 
 
 def test_requests_arrive_with_their_number(ring_path):
