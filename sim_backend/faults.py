@@ -119,12 +119,8 @@ class WireFaults:
 
     def __init__(self) -> None:
         self._active: list[Fault] = []
+        self.is_clean = True  # frames pass untouched
         self._left: dict[int, int] = {}  # frames that a counted fault still takes, by id of the fault object
-
-    @property
-    def is_clean(self) -> bool:
-        """Tell that frames pass untouched."""
-        return not self._active
 
     @property
     def is_bus_off(self) -> bool:
@@ -139,6 +135,7 @@ class WireFaults:
                 self._left[id(fault)] = fault.count
         elif fault in self._active:
             self._active.remove(fault)
+        self.is_clean = not self._active
 
     def passed(self, can_id: int, payload: bytes) -> list[tuple[int, bytes]]:
         """Return what becomes of a frame: (delay in ns, payload) of each copy that arrives."""

@@ -162,7 +162,8 @@ def _motion_stop(g, m, now):
     if not g.travel_low_m <= rest_m <= g.travel_high_m:
         return _VELOCITY
     # A late line leaves the position of the cycle before, a whole step behind; its age is watched by itself.
-    if fresh and not abs(m.end_position_m - now.position_m) <= g.following_error_m:
+    judged = fresh or not np.isfinite(now.position_m)
+    if judged and not abs(m.end_position_m - now.position_m) <= g.following_error_m:
         return _FOLLOWING_ERROR
     return _NONE
 

@@ -343,6 +343,7 @@ class RequestWriter:
         self.memory = _create(path, _REQUEST_MAGIC, dtype, 1, "")
         self.value = np.zeros(1, dtype)
         self._bytes = self.value.view(np.uint8)  # numpy copies field by field otherwise: 6 us
+        self._source, self._source_bytes = self.value, self._bytes
         _publish(np.zeros(1, np.int64), np.zeros(1, dtype), self.value)
 
     def publish(self, values: np.ndarray | Mapping[str, object]) -> int:
@@ -357,7 +358,9 @@ class RequestWriter:
         else:
             if values.dtype != self.value.dtype or values.shape != (1,):
                 raise RecordError(f"request block: {values.dtype} of shape {values.shape} is not one of its values")
-            self._bytes[:] = values.view(np.uint8)
+            if values is not self._source:
+                self._source, self._source_bytes = values, values.view(np.uint8)
+            self._bytes[:] = self._source_bytes
         _publish(self.memory.counter, self.memory.slots, self.value)
         return int(self.memory.counter[0]) // 2
 

@@ -604,6 +604,11 @@ class Supervisor:
         """Run a segment of SETPOINT rows that begins where the stage holds; returns how it ended."""
         if setpoints.size > SEGMENT_ROWS:
             raise RequestError(f"{name}: {setpoints.size} setpoints, {SEGMENT_ROWS} fit; split the trajectory")
+        for field in SETPOINT.names or ():
+            odd = np.flatnonzero(~np.isfinite(setpoints[field]))
+            if odd.size:
+                value = setpoints[field][odd[0]]
+                raise RequestError(f"{name}: setpoint {odd[0]} has {field} = {value}; every value must be finite")
         status = self.status()
         if status["phase"] != Phase.TRACKING:
             raise RequestError(f"{name}: the stage is not armed; enable it first")

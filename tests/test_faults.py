@@ -18,7 +18,7 @@ from stagectl.record import read_run
 from stagectl.replay import replay
 from stagectl.requests import Phase
 from stagectl.row import SENSOR_BYTES_COUNT
-from stagectl.signals import STOP_TEXT, Stop
+from stagectl.signals import SETPOINT, STOP_TEXT, Stop
 from stagectl.supervisor import BacklashEstimate, Supervisor
 from tests.small_disk import small_disk
 from tests.stage import with_values
@@ -122,15 +122,16 @@ def leave_the_stroke(stage, backend):
     rows["relative_position_m"][left] = np.linspace(0.0, -3e-3, count)
 
 
-def believe_nan(name: str) -> Strike:
-    """Let a belief without a number reach the law."""
+def believe_nan(stage, backend):
+    """A belief without a number reaches the law."""
+    stage._belief["micro_mass_kg"] = math.nan
+    decoder = backend.servo.decoder
+    stage._publish_update(decoder.macro_zero_counts, decoder.end_zero_counts)
 
-    def strike(stage, backend):
-        stage._belief[name] = math.nan
-        decoder = backend.servo.decoder
-        stage._publish_update(decoder.macro_zero_counts, decoder.end_zero_counts)
 
-    return strike
+def lose_the_reference(stage, backend):
+    """The setpoints are nan from here on."""
+    stage.link.segments["position_m"][:] = math.nan
 
 
 CASES = {
@@ -195,11 +196,13 @@ CASES = {
     "host held up": Case(hold_the_host_up(0.03), Stop.OVERRUN, r"began 29\.\d ms late, limit 20 ms"),
     "supervisor silent": Case(fall_silent, Stop.SUPERVISOR_SILENT, r"for 0\.50\d s, limit 0\.5 s", guided=True),
     "lease": Case(let_the_lease_go, Stop.LEASE, r"it ended \d+\.\d ms ago", guided=True),
-    "nan": Case(
-        believe_nan("micro_mass_kg"), Stop.COMMAND_NOT_FINITE, "dsmc asked nan N of the macro, nan N of the micro"
-    ),
-    "nan in position mode": Case(
-        believe_nan("left_m"), Stop.COMMAND_NOT_FINITE, "dsmc asked", profile={"macro__mode": "position"}
+    "nan": Case(believe_nan, Stop.COMMAND_NOT_FINITE, "dsmc asked nan N of the macro, nan N of the micro"),
+    "nan in position mode": Case(  # where a target that is nan has no integer that could be sent
+        lose_the_reference,
+        Stop.FOLLOWING_ERROR,
+        "end nan um from its",
+        guided=True,
+        profile={"macro__mode": "position"},
     ),
     "following error": Case(
         jump, Stop.FOLLOWING_ERROR, r"end -1000\.\d um from its reference at 0\.\d+ m, limit 200 um", guided=True
@@ -473,6 +476,17 @@ def test_a_belief_that_is_none_is_refused(tmp_path, oled_profile, oled_machine):
     one = Stage(tmp_path / "run", oled_profile, oled_machine)
     with one, pytest.raises(RequestError, match=r"must be finite, width and stiffness above 0"):
         one.stage.take_backlash(BacklashEstimate(2e-5, math.nan, 1e-8, 1e-8, 1e4, 1e4, 1.0, 1.0))
+
+
+def test_setpoints_that_are_none_are_refused(tmp_path, oled_profile, oled_machine):
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    setpoints = np.zeros(10, SETPOINT)
+    setpoints["velocity_m_per_s"][7] = math.inf
+    with one:
+        one.arm()
+        setpoints["position_m"] = one.stage.status()["setpoint_position_m"]
+        with pytest.raises(RequestError, match=r"leap: setpoint 7 has velocity_m_per_s = inf; every value must be"):
+            one.stage.follow(setpoints, "leap")
 
 
 def arm(profile, backend, folder) -> None:
