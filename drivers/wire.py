@@ -188,26 +188,27 @@ class WireDecoder:
     def _take_frames(self, inbox: Inbox, m: np.ndarray) -> None:
         """Decode process data, inputs and emergencies; LinkError on a short frame, nothing of it taken."""
         fresh = 0
-        m["tpdos_new"][0] = 0
+        record = m[0]  # a view: half the cost of a field of the array, sixteen times a cycle
+        record["tpdos_new"] = 0
         for axis, (codec, status, position, torque, step_m, force_n, bit, node_id) in self._axes.items():
             payload = inbox.macro_tpdo if bit == 1 else inbox.micro_tpdo
             if payload is not None:
                 values = _decoded(codec, payload, f"{axis} (node {node_id})")
-                m[f"{axis}_statusword"][0] = values[status]
-                m[f"{axis}_encoder_m"][0] = values[position] * step_m
-                m[f"{axis}_reported_force_n"][0] = values[torque] * force_n
+                record[f"{axis}_statusword"] = values[status]
+                record[f"{axis}_encoder_m"] = values[position] * step_m
+                record[f"{axis}_reported_force_n"] = values[torque] * force_n
                 fresh |= bit
             payload = inbox.macro_inputs_tpdo if bit == 1 else inbox.micro_inputs_tpdo
             if payload is not None:
                 inputs = self.mappings[axis].inputs_tpdo
-                m[f"{axis}_digital_inputs"][0] = _decoded(inputs, payload, f"inputs of {axis} (node {node_id})")[0]
+                record[f"{axis}_digital_inputs"] = _decoded(inputs, payload, f"inputs of {axis} (node {node_id})")[0]
             payload = inbox.macro_emcy if bit == 1 else inbox.micro_emcy
             if payload is not None:
                 code = cia402.decode_emergency(payload)[0]
-                powered = cia402.state_of(int(m[f"{axis}_statusword"][0])) in _POWERED
+                powered = cia402.state_of(int(record[f"{axis}_statusword"])) in _POWERED
                 if powered or code >> 8 not in _SILENCE_CODES:
-                    m["emergency"][0] = node_id << 16 | code if code else 0
-        m["tpdos_new"][0] = fresh
+                    record["emergency"] = node_id << 16 | code if code else 0
+        record["tpdos_new"] = fresh
 
     def decode(self, inbox: Inbox, m: np.ndarray) -> str:
         """Write what the inbox says into a MEASUREMENT; lease, overrun and lost commands are the caller's.
@@ -216,6 +217,7 @@ class WireDecoder:
         """
         valid = 0
         text = ""
+        record = m[0]
         if inbox.sensor_bytes:
             for reading in self.framer.feed(inbox.sensor_bytes):
                 if self._renumbers(reading, inbox.sensor_arrival_t_ns):
@@ -228,22 +230,22 @@ class WireDecoder:
             self._take_frames(inbox, m)
         except LinkError as error:
             text = str(error)
-        m["t_ns"][0] = inbox.t_ns
-        m["samples_new"][0] = valid
-        m["sequence"][0] = self.sequence
+        record["t_ns"] = inbox.t_ns
+        record["samples_new"] = valid
+        record["sequence"] = self.sequence
         if self.sequence >= 0:
             age_ns = sample_clock.sample_age_ns(self.clock, self.sequence, inbox.t_ns)
             due = self.sequence + math.floor((age_ns - self._earliest_ns) / self.period_ns)
             self.cycle = max(due, self.cycle + 1 if valid and self.cycle < 0 else self.cycle, self.sequence)
-            m["sample_t_ns"][0] = sample_clock.sample_t_ns(self.clock, self.sequence)
-            m["macro_position_m"][0] = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
-            m["end_position_m"][0] = (self.end_counts - self.end_zero_counts) * self.end_m_per_count
-            if valid and self.encoder_trusted and m["tpdos_new"][0] & 1:
-                self._look_for_stuck_counts(float(m["macro_encoder_m"][0]))
+            record["sample_t_ns"] = sample_clock.sample_t_ns(self.clock, self.sequence)
+            record["macro_position_m"] = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
+            record["end_position_m"] = (self.end_counts - self.end_zero_counts) * self.end_m_per_count
+            if valid and self.encoder_trusted and record["tpdos_new"] & 1:
+                self._look_for_stuck_counts(float(record["macro_encoder_m"]))
             if valid and self.sequence == self.cycle:  # behind a late line the drive's position is of a later SYNC
                 self._compare_with_encoder(m, inbox.sync_t_ns)
-        m["cycle"][0] = self.cycle
-        m["reference_lost"][0] = self.reference_lost
+        record["cycle"] = self.cycle
+        record["reference_lost"] = self.reference_lost
         return text
 
     def _look_for_stuck_counts(self, encoder_m: float) -> None:
@@ -268,17 +270,18 @@ class WireDecoder:
         host held the SYNC up is not known to better than a period, so one period's way is allowed besides: an offset
         stays when the stage stands, and is found then.
         """
-        macro_m = float(m["macro_position_m"][0])
-        if self.encoder_trusted and self.sequence == self._compared_sequence + 1 and m["tpdos_new"][0] & 1:
-            since_ns = int(m["sample_t_ns"][0]) - sync_t_ns
+        record = m[0]
+        macro_m = float(record["macro_position_m"])
+        if self.encoder_trusted and self.sequence == self._compared_sequence + 1 and record["tpdos_new"] & 1:
+            since_ns = int(record["sample_t_ns"]) - sync_t_ns
             laser_m = macro_m - (macro_m - self._compared_m) * (since_ns / self.period_ns)
             allowed_m = self._disagreement_m + abs(macro_m - self._compared_m)
-            if abs(laser_m - float(m["macro_encoder_m"][0])) <= allowed_m:
+            if abs(laser_m - float(record["macro_encoder_m"])) <= allowed_m:
                 self._disagreements = 0
             else:
                 self._disagreements += 1
                 if self._disagreements >= _DISAGREEMENTS_IN_A_ROW:
-                    away_um = abs(laser_m - float(m["macro_encoder_m"][0])) * 1e6
+                    away_um = abs(laser_m - float(record["macro_encoder_m"])) * 1e6
                     self._lose_reference(
                         f"macro laser and the drive's encoder differ by {away_um:.0f} um, "
                         f"limit {allowed_m * 1e6:.0f} um"

@@ -92,6 +92,8 @@ class BusModel:
     def next_delivery_t_ns(self) -> int | None:
         """Return when the next frame is received by all (end of frame), None with empty queues."""
         if self._next is None:
+            if not any(self._queues):  # asked several times a cycle, mostly of an idle bus
+                return None
             self._arbitrate()
         return None if self._next is None else self._next[0]
 

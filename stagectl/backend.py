@@ -100,8 +100,8 @@ class Backend(Protocol):
 _END_S = 20.0
 """The longest that a stage takes to come to rest."""
 
-_SYNC_STEP_NS = 120_000
-_SYNC_PATIENCE_NS = 360_000  # two RPDOs and SYNC take 220 us; longer means that the bus does not carry it
+_SYNC_STEP_NS = 230_000
+_SYNC_PATIENCE_NS = 460_000  # two RPDOs and SYNC take 220 us; longer means that the bus does not carry it
 
 _SHARED_MEMORY = Path("/dev/shm")
 
