@@ -276,8 +276,8 @@ def test_every_machine_runs(name, wire_of):
 
 
 def test_the_drivers_master_arms_the_rig(machine, wire_of):
-    canopen_master = pytest.importorskip("drivers.canopen_master")
-    arming = pytest.importorskip("drivers.arming")
+    from drivers import arming, canopen_master
+
     wire = wire_of(machine)
     master = canopen_master.Master(wire.network_bus, synchronous=True)
     drives = [

@@ -538,3 +538,12 @@ def test_nothing_interrupts_the_way_to_rest(capsys):
         deliver("test", True, work)
     assert end.value.exit_code == 0
     assert json.loads(capsys.readouterr().out)["stopped"]
+
+
+@pytest.mark.parametrize("distance", ["nan", "inf", "5"])
+def test_a_jog_that_can_not_be_is_refused_before_anything_opens(capsys, tmp_path, distance):
+    runs = tmp_path / "runs"
+    code, _, err = call(capsys, "jog", "--distance-m", distance, "--backend", "batch", "--runs", str(runs))
+    assert code == 2
+    assert "--distance-m" in err
+    assert not runs.exists()  # no run was begun: the stage did not even home

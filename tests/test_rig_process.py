@@ -125,8 +125,8 @@ def test_it_serves_answers_and_ends(start, tmp_path):
 
 
 def test_the_drivers_open_it(start):
-    canopen_master = pytest.importorskip("drivers.canopen_master")
-    can_bus = pytest.importorskip("drivers.can_bus")
+    from drivers import can_bus, canopen_master
+
     rig = start()
     machine = load_machine("oled-printer")
     master = canopen_master.Master(can_bus.open_network("hub", str(rig.socket_path)))

@@ -62,6 +62,12 @@ def jog(
     """Home, move by a distance."""
     where = _with_drives(place(profile, backend, runs_root, seed), "jog")
     law = law_name(law, where.profile)
+    low_m, high_m = where.profile.macro.travel_m
+    if not abs(distance_m) <= high_m - low_m:  # before anything opens: homing is motion too
+        raise RequestError(
+            f"--distance-m is {distance_m:g}, the travel of {where.profile.name} is {high_m - low_m:g} m; "
+            "give a finite distance within it"
+        )
 
     def by_distance(stage: Supervisor) -> Outcome:
         return stage.move(float(stage.status()["setpoint_position_m"]) + distance_m, law)
