@@ -6,6 +6,7 @@ from drivers.wire import Inbox, WireDecoder
 from sim_backend.batch import BatchWire
 from sim_backend.machine import Machine
 from sim_backend.rig import Rig
+from stagectl.fields import fields
 from stagectl.profile import Profile
 from stagectl.signals import MEASUREMENT, new
 
@@ -18,18 +19,17 @@ def errors_s(profile: Profile, machine: Machine, seed: int, duration_s: float) -
     rig = Rig(machine, seed=seed)
     wire = BatchWire(rig)
     decoder = WireDecoder(profile, {})
-    measurement, inbox = new(MEASUREMENT), Inbox()
+    measured, inbox = fields(new(MEASUREMENT)), Inbox()
     end_t_ns = wire.t_ns + round(duration_s * 1e9)
     sequences, instants = [], []
     while wire.t_ns < end_t_ns:
         wire.advance_to(wire.next_line_t_ns())
         inbox.clear()
         inbox.t_ns = wire.t_ns
-        inbox.sensor_bytes = wire.serial.read()
-        inbox.sensor_arrival_t_ns = wire.serial.arrival_t_ns
-        decoder.decode(inbox, measurement)
-        sequences.append(int(measurement["sequence"][0]))
-        instants.append(int(measurement["sample_t_ns"][0]))
+        inbox.add_sensor_bytes(wire.serial.read(), wire.serial.arrival_t_ns)
+        decoder.decode(inbox, measured)
+        sequences.append(measured.sequence)
+        instants.append(measured.sample_t_ns)
     wire.close()
     truth = rig.truth.arrays()
     true_t_ns = truth["t_ns"][np.searchsorted(truth["sequence"], sequences)]

@@ -98,9 +98,10 @@ def wire_ratio(profile: Profile, machine: Machine, law: str, folder: Path) -> fl
 def servo_s(profile: Profile, folder: Path) -> dict[str, float]:
     """Run the servo as a process against the rig as another, in real time; return medians in s.
 
-    `due_to_written`: from the instant that the cycle was due, its line readable, to the last frame written: waking up,
-    reading line and process data, decoding, tick, encoding, writing. `woken_to_written`: the same without waking up and
-    reading. `tick`: decoding, tick and encoding. Errors: StagectlError where host or rig don't let it run.
+    `readable_to_written`: from the instant that the line is readable and the cycle due, whichever is later, to the last
+    frame written: reading, decoding, tick, encoding, writing. `due_to_written`: the same from the instant due, lines
+    that came late included. `tick`: decoding, tick and encoding after the instant due. Errors: StagectlError where host
+    or rig don't let it run.
     """
     found, problem = [], "the rig did not come to a tick"
     for attempt in range(_RIG_TRIES_COUNT):
@@ -124,9 +125,10 @@ def servo_s(profile: Profile, folder: Path) -> dict[str, float]:
 
 def _medians(rows: np.ndarray) -> dict[str, float]:
     """Median of the runs' p50, where a run is a fifth of the rows."""
+    due_t_ns = rows["t_ns"] - rows["lateness_ns"]
     columns = {
-        "due_to_written": rows["sync_end_t_ns"] - (rows["t_ns"] - rows["lateness_ns"]),
-        "woken_to_written": rows["sync_end_t_ns"] - rows["t_ns"],
+        "readable_to_written": rows["sync_end_t_ns"] - np.maximum(due_t_ns, rows["first_arrival_t_ns"]),
+        "due_to_written": rows["sync_end_t_ns"] - due_t_ns,
         "tick": rows["tick_ns"],
     }
     return {

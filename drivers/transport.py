@@ -16,6 +16,9 @@ CHUNK_LIMIT_BYTES = 512
 """Sensor bytes of one cycle, what one row can hold; the rest comes with the next cycle."""
 
 _BUS_OFF = 0x40  # linux/can/error.h
+_SPIN_NS = 150_000
+"""The last stretch before a cycle is awaited awake: the line comes in it, and waking up takes 60 us (p50) to 110 us
+(p90) on an ordinary kernel. From the instant due to SYNC written it is 116 us with 80 us of it, 67 us with 150 us."""
 
 
 def error_frame_text(can_id: int) -> str:
@@ -41,6 +44,7 @@ class RealtimeTransport:
         self._bus, self._port, self._names = bus, port, names
         self._readable = [port.fileno()]  # empty once the port is gone
         self._kept = b""  # read already, but beyond what one row holds
+        self._polled = False  # port and bus were looked at in this cycle's last stretch
         self.failure = ""
         self.error_frames_count = 0
 
@@ -53,14 +57,44 @@ class RealtimeTransport:
         """Return the host clock."""
         return now_t_ns()
 
+    def await_bytes(self, deadline_t_ns: int, inbox: Inbox) -> bool:
+        """Wait until the deadline, or until the cycle's first sensor bytes are stamped and in the inbox."""
+        if self._kept and not inbox.sensor_bytes:
+            inbox.add_sensor_bytes(self._kept, inbox.sensor_arrival_t_ns)
+            self._kept = b""
+        while not inbox.sensor_bytes and self._wait(deadline_t_ns, inbox):
+            pass
+        return bool(inbox.sensor_bytes)
+
     def receive(self, deadline_t_ns: int, inbox: Inbox) -> int:
-        """Wait until the deadline, stamping sensor bytes as they become readable; then take the bus's frames."""
-        inbox.sensor_bytes, self._kept = self._kept, b""
-        while (left_ns := deadline_t_ns - now_t_ns()) > 0:
-            if self._kept or not self._readable:
-                time.sleep(left_ns * 1e-9)
-            elif self._line_within(left_ns * 1e-9):
+        """Wait until the deadline, stamping sensor bytes as they become readable, and take the bus's frames."""
+        self.await_bytes(deadline_t_ns, inbox)
+        while self._wait(deadline_t_ns, inbox):
+            pass
+        if not self._polled:  # woken too late to look at port and bus before the deadline
+            self._look(inbox)
+        self._polled = False
+        return now_t_ns()
+
+    def _wait(self, deadline_t_ns: int, inbox: Inbox) -> bool:
+        """Wait for sensor bytes, for the last stretch before the deadline, or for the deadline; False at the last."""
+        left_ns = deadline_t_ns - now_t_ns()
+        if left_ns <= 0:
+            return False
+        if left_ns <= _SPIN_NS:
+            if not self._polled:
+                self._look(inbox)
+                self._polled = True
+            elif self._line_within(0.0):
                 self._read(inbox)
+        elif self._kept or not self._readable:
+            time.sleep((left_ns - _SPIN_NS) * 1e-9)
+        elif self._line_within((left_ns - _SPIN_NS) * 1e-9):
+            self._read(inbox)
+        return True
+
+    def _look(self, inbox: Inbox) -> None:
+        """Take what port and bus have now."""
         while not self._kept and self._line_within(0.0):
             self._read(inbox)
         try:
@@ -68,7 +102,6 @@ class RealtimeTransport:
                 self._take(frame, inbox)
         except LinkError as error:
             self.failure = str(error)
-        return now_t_ns()
 
     def _line_within(self, wait_s: float) -> bool:
         """Wait for sensor bytes; select, because poll and epoll count in whole milliseconds.
@@ -89,14 +122,16 @@ class RealtimeTransport:
             inbox.take(name, payload)
 
     def _read(self, inbox: Inbox) -> None:
-        inbox.sensor_arrival_t_ns = now_t_ns()
+        arrival_t_ns = now_t_ns()
         try:
-            data = inbox.sensor_bytes + self._port.read()
+            data = self._port.read()
         except LinkError as error:
             self.failure = str(error)
             self._readable.clear()
             return
-        inbox.sensor_bytes, self._kept = data[:CHUNK_LIMIT_BYTES], data[CHUNK_LIMIT_BYTES:]
+        room = CHUNK_LIMIT_BYTES - len(inbox.sensor_bytes)
+        inbox.add_sensor_bytes(data[:room], arrival_t_ns)
+        self._kept = data[room:]
 
     def send(self, frames: list[tuple[int, bytes]]) -> tuple[bool, int]:
         """Queue frames in this order; a full queue is a missed command, never sent again."""

@@ -129,10 +129,15 @@ class BatchTransport:
         """Return virtual time."""
         return self._wire.t_ns
 
+    def await_bytes(self, deadline_t_ns: int, inbox: Inbox) -> bool:
+        """Tell nothing before the deadline: in virtual time decoding early gains nothing."""
+        return False
+
     def receive(self, deadline_t_ns: int, inbox: Inbox) -> int:
         """Let everything happen until the deadline, line by line, so that each has its own arrival."""
         wire = self._wire
-        inbox.sensor_bytes, self._kept = self._kept[:CHUNK_LIMIT_BYTES], self._kept[CHUNK_LIMIT_BYTES:]
+        if self._kept:
+            self._add(inbox, self._kept, inbox.sensor_arrival_t_ns)
         until_t_ns = max(deadline_t_ns, wire.t_ns)
         while not self._kept and not self._port_failed and (line_t_ns := wire.next_line_t_ns()) <= until_t_ns:
             wire.advance_to(line_t_ns)
@@ -158,10 +163,14 @@ class BatchTransport:
             return False
         if not data:
             return False
-        data = inbox.sensor_bytes + data
-        inbox.sensor_bytes, self._kept = data[:CHUNK_LIMIT_BYTES], data[CHUNK_LIMIT_BYTES:]
-        inbox.sensor_arrival_t_ns = self._wire.serial.arrival_t_ns
+        self._add(inbox, data, self._wire.serial.arrival_t_ns)
         return True
+
+    def _add(self, inbox: Inbox, data: bytes, arrival_t_ns: int) -> None:
+        """Give the inbox what its row can hold, keep the rest for the next."""
+        room = CHUNK_LIMIT_BYTES - len(inbox.sensor_bytes)
+        inbox.add_sensor_bytes(data[:room], arrival_t_ns)
+        self._kept = data[room:]
 
     def send(self, frames: list[tuple[int, bytes]]) -> tuple[bool, int]:
         """Queue frames after the tick's time; the bus's arbitration does the rest."""

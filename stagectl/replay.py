@@ -15,6 +15,7 @@ from drivers.arming import DriveMapping
 from drivers.pdo import Codec
 from drivers.wire import Inbox, WireDecoder
 from stagectl.errors import RecordError
+from stagectl.fields import fields
 from stagectl.plant import PLANT_PARAMETERS
 from stagectl.profile import Profile
 from stagectl.record import Run, read_run
@@ -102,6 +103,8 @@ def _inbox_of(row: np.void, inbox: Inbox) -> None:
     """Fill an inbox with a row's raw bytes."""
     inbox.clear()
     inbox.t_ns = int(row["t_ns"])
+    inbox.first_arrival_t_ns = int(row["first_arrival_t_ns"])
+    inbox.first_bytes_count = int(row["first_bytes_count"])
     inbox.sensor_arrival_t_ns = int(row["sensor_arrival_t_ns"])
     inbox.sensor_bytes = row["sensor_bytes"][: int(row["sensor_bytes_count"])].tobytes()
     for name in Inbox.FRAMES:
@@ -113,6 +116,7 @@ def _inbox_of(row: np.void, inbox: Inbox) -> None:
 def _compare(rows: np.ndarray, decoder: WireDecoder, tracker: Tracker, updates: Mapping[int, Any]) -> Comparison:
     inbox = Inbox()
     m = tracker.measurement
+    seen = fields(m)
     phase_before, update_before, ticks, differing = int(Phase.IDLE), 0, 0, 0
     first = ""
     worst_n = 0.0
@@ -120,7 +124,9 @@ def _compare(rows: np.ndarray, decoder: WireDecoder, tracker: Tracker, updates: 
         row = rows[index]
         _inbox_of(row, inbox)
         inbox.sync_t_ns = int(rows[index - 1]["sync_end_t_ns"]) if index else 0
-        decoder.decode(inbox, m)
+        seen.load()  # what the update below and the loop changed behind the decoder
+        decoder.decode(inbox, seen)
+        seen.store()
         number = int(row["update_number"])
         if number != update_before:
             if number not in updates:

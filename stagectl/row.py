@@ -68,7 +68,9 @@ ROW = np.dtype(
         ("lateness_ns", "i8"),  # wake-up behind its grid point
         ("tick_ns", "i8"),  # estimate + law + guard
         ("sync_end_t_ns", "i8"),  # end of the SYNC frame that latches this cycle's command
-        ("sensor_arrival_t_ns", "i8"),  # when the newest sensor bytes could be read
+        ("first_arrival_t_ns", "i8"),  # when the cycle's first sensor bytes could be read ...
+        ("first_bytes_count", "i8"),  # ... and how many they were
+        ("sensor_arrival_t_ns", "i8"),  # when the newest could
         ("sensor_bytes_count", "i8"),
         ("sensor_bytes", "u1", (SENSOR_BYTES_COUNT,)),  # raw, as read in this cycle: replay starts here
         *(field for name in FRAMES for field in _frame(name)),

@@ -32,6 +32,8 @@ _LOOP = (
     "lateness_ns",
     "tick_ns",
     "sync_end_t_ns",
+    "first_arrival_t_ns",
+    "first_bytes_count",
     "sensor_arrival_t_ns",
     "sensor_bytes_count",
     "macro_controlword",

@@ -79,6 +79,10 @@ class _Rehearsal:
         """Return a time that only cycles move."""
         return self._t_ns
 
+    def await_bytes(self, deadline_t_ns: int, inbox: Inbox) -> bool:
+        """Nothing comes."""
+        return False
+
     def receive(self, deadline_t_ns: int, inbox: Inbox) -> int:
         """Receive nothing, at once."""
         self._t_ns = deadline_t_ns
@@ -105,7 +109,7 @@ def _warm(profile: Profile) -> None:
         one = tracker.active
         fill_row(
             row, one.measurement, tracker.setpoint, one.command, one.model, one.law, one.backlash,
-            0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 1.0,
+            0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 1.0,
         )  # fmt: skip
     fill_status(
         status, one.measurement, tracker.setpoint, tracker.hold, one.backlash,

@@ -77,6 +77,28 @@ def test_what_one_row_can_not_hold_comes_with_the_next_cycle(world):
     assert third.sensor_bytes == b""
 
 
+def test_the_first_bytes_of_a_cycle_are_there_before_it_is_due_and_keep_their_own_time(world):
+    """The servo decodes them meanwhile; what comes later has a time of its own."""
+    transport, inbox = world.transport, Inbox()
+    due_t_ns = transport.now_t_ns() + 200 * MS
+    os.write(world.master, b"first")
+    assert transport.await_bytes(due_t_ns, inbox)
+    assert transport.now_t_ns() < due_t_ns - 100 * MS
+    assert (inbox.sensor_bytes, inbox.first_bytes_count) == (b"first", 5)
+    os.write(world.master, b" and the rest")
+    due_t_ns = transport.now_t_ns() + 5 * MS
+    assert transport.receive(due_t_ns, inbox) >= due_t_ns
+    assert (inbox.sensor_bytes, inbox.first_bytes_count) == (b"first and the rest", 5)
+    assert 0 < inbox.first_arrival_t_ns < inbox.sensor_arrival_t_ns
+
+
+def test_without_bytes_the_wait_ends_when_the_cycle_is_due(world):
+    inbox = Inbox()
+    due_t_ns = world.transport.now_t_ns() + 2 * MS
+    assert not world.transport.await_bytes(due_t_ns, inbox)
+    assert world.transport.now_t_ns() >= due_t_ns
+
+
 def test_a_port_that_is_unplugged_is_said_and_the_bus_goes_on(world):
     world.serve()
     world.unplug()
