@@ -5,6 +5,10 @@ name ends in its unit. The same text compiles for the tick and runs on arrays in
 positive in the direction of positive position. Pure; knows no bus and no clock.
 """
 
+# An effect's bare argument names are its declaration, and take floats as well as arrays: no types beside them.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
+
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass

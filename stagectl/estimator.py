@@ -7,10 +7,16 @@ steady-state gains of the Kalman filter for that model. Prediction from the samp
 next command acts is the same code run ahead. Pure; knows no bus and no clock.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stagectl.compiled import compiled
 from stagectl.plant import PLANT_PARAMETERS, PLANT_STATE
+from stagectl.signals import Record
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 ESTIMATOR = np.dtype(
     [
@@ -46,7 +52,7 @@ _BRIDGED_SAMPLES = 10.0  # prediction over 10 ms is still within a few nm of the
 FREE_SUPPLY_V = 1e12  # a belief's current loop never runs out of voltage
 
 
-def belief(profile) -> np.ndarray:
+def belief(profile: "Profile") -> np.ndarray:
     """Make PLANT_PARAMETERS of what the profile believes (attributes named as in a profile)."""
     q = np.zeros(1, PLANT_PARAMETERS)
     macro, micro, backlash = profile.macro, profile.micro, profile.backlash
@@ -101,7 +107,7 @@ def kalman_gains(mass_kg: float, period_s: float, noise_m: float, drift_n_per_sq
     return gain * scale / scale[0]
 
 
-def init(profile) -> np.ndarray:
+def init(profile: "Profile") -> np.ndarray:
     """Make ESTIMATOR for a profile: gains from its noise and drift densities, nothing seen yet."""
     e = np.zeros(1, ESTIMATOR)
     period_s = 1.0 / profile.cycle.rate_hz
@@ -128,7 +134,7 @@ def init_model() -> np.ndarray:
 
 
 @compiled
-def start(e, s, m):
+def start(e: Record, s: Record, m: Record) -> None:
     """Place the believed machine at rest at the first sample."""
     s.macro_position_m = m.macro_position_m
     s.end_position_m = m.end_position_m
@@ -144,7 +150,7 @@ def start(e, s, m):
 
 
 @compiled
-def correct(e, s, q, m):
+def correct(e: Record, s: Record, q: Record, m: Record) -> None:
     """Take a fresh sample into the believed machine."""
     innovation = m.macro_position_m - s.macro_position_m
     e.macro_innovation_m = innovation

@@ -7,7 +7,7 @@ from Python a cycle at a time, or from the compiled loop of `stagectl.batch`. Pu
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from stagectl import backlash, compose, estimator, guard
 from stagectl.compiled import direct
 from stagectl.laws import dsmc, pid
 from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT, new
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 LAWS: dict[str, ModuleType] = {"dsmc": dsmc, "pid": pid}
 """Every law by the name that profiles and commands use."""
@@ -73,6 +76,35 @@ def estimate(m, e, model, ahead, b, q, p):
 
 
 @compiled
+def micro_made(motor_n, f, relative_m, rate, p):
+    """Return the force that the micro's motor makes when `motor_n` is asked of it, actuator effects and all."""
+    return motor_n + forces.micro_actuator(f.middle_end_position_m, f.middle_end_velocity_m_per_s, relative_m, rate,
+                                           f.micro_current_a, motor_n, motor_n, f.t_s, p)
+
+
+@compiled
+def macro_made(motor_n, f, relative_m, rate, felt_n, p):
+    """Return the force that the macro's motor makes when `motor_n` is asked of it and the micro feels `felt_n`."""
+    return motor_n + forces.macro_actuator(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s, relative_m, rate,
+                                           f.macro_current_a, motor_n, felt_n, f.t_s, p)
+
+
+@compiled
+def asked_for(force_n, none_n, made_n, limit_n):
+    """Return what to ask so that `force_n` is made: exact where the actuator is a straight line, F / (1 + e).
+
+    `none_n` is made when nothing is asked, `made_n` when `force_n` is. A force that the law cut to what its limit
+    makes comes out at the limit, and rounding must not carry it beyond: the guard stops there.
+    """
+    if force_n == 0.0:
+        return -none_n
+    asked_n = (force_n - none_n) / ((made_n - none_n) / force_n)  # without actuator effects force_n, to the last bit
+    if abs(asked_n) <= limit_n * (1.0 + 1e-12):
+        return reference.limited(asked_n, limit_n)
+    return asked_n
+
+
+@compiled
 def decide(m, now, later, e, ahead, after, l, q, p):
     """Return (macro force, micro force) that the law asks for."""
     a = ahead[0]
@@ -83,17 +115,20 @@ def decide(m, now, later, e, ahead, after, l, q, p):
     relative_m = f.middle_end_position_m - f.middle_macro_position_m
     rate = f.middle_end_velocity_m_per_s - f.middle_macro_velocity_m_per_s
     micro_n = 0.0
+    felt_n = 0.0
+    macro_limit_n = l[0].macro_force_limit_n
     macro_known_n = plant.base_force(f, q[0])
     if q[0].has_micro != 0.0:
         contact_n = forces.contact(f.penetration_m, f.penetration_velocity_m_per_s, p)
         joint_n = plant.joint_force(f, q[0], contact_n)
         known_n = joint_n + forces.micro_force(f.middle_end_position_m, f.middle_end_velocity_m_per_s, relative_m,
                                                rate, f.micro_current_a, f.micro_force_n, f.micro_force_n, f.t_s, p)
-        micro_n = law.precision(l[0], a, f, x, now, later, q[0].micro_mass_kg, known_n, a.micro_disturbance_n,
-                                q[0], x.period_s)
-        felt_n = micro_n
-        micro_n -= forces.micro_actuator(f.middle_end_position_m, f.middle_end_velocity_m_per_s, relative_m, rate,
-                                         f.micro_current_a, micro_n, micro_n, f.t_s, p)
+        limit_n = l[0].precision_force_limit_n
+        felt_n = law.precision(l[0], a, f, x, now, later, q[0].micro_mass_kg, known_n, a.micro_disturbance_n,
+                               micro_made(-limit_n, f, relative_m, rate, p),
+                               micro_made(limit_n, f, relative_m, rate, p), q[0], x.period_s)
+        micro_n = asked_for(felt_n, micro_made(0.0, f, relative_m, rate, p),
+                            micro_made(felt_n, f, relative_m, rate, p), limit_n)
         macro_known_n -= joint_n
         macro_known_n += forces.macro_force(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s, relative_m,
                                             rate, f.macro_current_a, f.macro_force_n, felt_n, f.t_s, p)
@@ -102,14 +137,17 @@ def decide(m, now, later, e, ahead, after, l, q, p):
             macro_n -= macro_known_n
         else:
             macro_n = law.carrier(l[0], a, f, x, now, later, q[0].macro_mass_kg, macro_known_n,
-                                  a.macro_disturbance_n, q[0], x.period_s)
+                                  a.macro_disturbance_n,
+                                  macro_made(-macro_limit_n, f, relative_m, rate, felt_n, p),
+                                  macro_made(macro_limit_n, f, relative_m, rate, felt_n, p), q[0], x.period_s)
     else:
         macro_known_n += forces.macro_force(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s, 0.0, 0.0,
                                             f.macro_current_a, f.macro_force_n, 0.0, f.t_s, p)
         macro_n = law.precision(l[0], a, f, x, now, later, q[0].macro_mass_kg, macro_known_n, a.macro_disturbance_n,
-                                q[0], x.period_s)
-    macro_n -= forces.macro_actuator(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s, relative_m, rate,
-                                     f.macro_current_a, macro_n, micro_n, f.t_s, p)
+                                macro_made(-macro_limit_n, f, relative_m, rate, felt_n, p),
+                                macro_made(macro_limit_n, f, relative_m, rate, felt_n, p), q[0], x.period_s)
+    macro_n = asked_for(macro_n, macro_made(0.0, f, relative_m, rate, felt_n, p),
+                        macro_made(macro_n, f, relative_m, rate, felt_n, p), macro_limit_n)
     return macro_n, micro_n
 
 
@@ -222,7 +260,7 @@ class Controller:
             getattr(self, name)[...] = snapshot[name]
 
 
-def controller(profile, law_name: str, *, has_drives: bool) -> Controller:
+def controller(profile: "Profile", law_name: str, *, has_drives: bool) -> Controller:
     """Make the controller of a profile under a law, nothing seen yet."""
     effects = [dict(row) for row in profile.effects]
     return Controller(
