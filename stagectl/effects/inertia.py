@@ -43,7 +43,7 @@ def mass_error(acceleration_m_per_s2, mass_kg, error_ratio):
     damping_ratio=(1e-3, 0.9),
     linear=("share_ratio",),
     symptom="rings at one frequency after each change of acceleration",
-    reference="Den Hartog, Mechanical Vibrations, section 3.2; Ewins, Modal Testing, section 2.4: one mode, by its base",
+    reference="Den Hartog, Mechanical Vibrations, section 3.2: a mass on a spring, moved by its base",
 )
 def flexible_mode(acceleration_m_per_s2, mass_kg, dt_s, share_ratio, frequency_hz, damping_ratio, memory):
     """A share of the mass sits on a spring: F = -mu m q'', q'' + 2 zeta w q' + w^2 q = -a, w = 2 pi f.
