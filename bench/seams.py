@@ -52,6 +52,7 @@ def compare(
         state = np.zeros(1, PLANT_STATE)
         for name, value in backend.rig.plant_state().items():
             state[name] = value
+        state["memory"] = backend.rig.effects_memory()
         controller_state = backend.servo.tracker.active.snapshot()
         first_sample = int(controller_state["estimator"]["cycle"][0]) + 1
         held_a = [float(node.drive.servo["torque_target_a"][0]) for node in backend.rig.nodes]
@@ -94,6 +95,7 @@ def compare(
     late = rows["sequence"] < rows["cycle"]
     start_t_ns = backend.rig.start_t_ns
     following = np.append(in_truth, in_truth[-1] + 1)
+    devices["sampled_s"] = 1e-9 * (truth["t_ns"][in_truth[0] - 1] - start_t_ns)
     instants_s = np.zeros((rows.size + 1, 2))
     instants_s[:, 0] = 1e-9 * (truth["t_ns"][following] - start_t_ns)
     instants_s[:-1, 1] = 1e-9 * (rows["sync_end_t_ns"] - start_t_ns)

@@ -4,13 +4,15 @@ The believed machine is the same plant code as the simulator's, composed with th
 two samples it feels the integers that were sent: the old command until the SYNC that latches the new one, then
 the new one. A sample corrects position, velocity and an unknown force on each axis (a random walk), with the
 steady-state gains of the Kalman filter for that model. Prediction from the sample's instant to the instant the
-next command acts is the same code run ahead. Pure; knows no bus and no clock.
+next command acts, lag and dead time of the profile's command effects included, is the same code run ahead. Pure;
+knows no bus and no clock.
 """
 
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stagectl import compose
 from stagectl.compiled import compiled
 from stagectl.plant import PLANT_PARAMETERS, PLANT_STATE
 from stagectl.signals import Record
@@ -22,6 +24,8 @@ ESTIMATOR = np.dtype(
     [
         ("period_s", "f8"),
         ("actuation_delay_s", "f8"),  # sample instant -> the SYNC that latches the command
+        ("lead_s", "f8"),  # from there until the force of the axis that carries the end follows, lag and dead time
+        ("macro_lead_s", "f8"),  # by which the macro's lag and dead time under a micro are longer than that
         ("longest_substep_s", "f8"),
         ("bridged_samples_max", "f8"),  # missing in a row that the identification's filters are carried over
         ("macro_amperes_per_word", "f8"),
@@ -113,6 +117,9 @@ def init(profile: "Profile") -> np.ndarray:
     period_s = 1.0 / profile.cycle.rate_hz
     e["period_s"] = period_s
     e["actuation_delay_s"] = profile.cycle.actuation_delay_s
+    macro_lag_s = compose.command_lag_s(profile.effects, "macro_command")
+    e["lead_s"] = macro_lag_s if profile.micro is None else compose.command_lag_s(profile.effects, "micro_command")
+    e["macro_lead_s"] = macro_lag_s - e["lead_s"]
     e["longest_substep_s"] = 300e-6
     e["bridged_samples_max"] = _BRIDGED_SAMPLES
     e["position_mode"] = float(profile.macro.mode == "position")
@@ -145,20 +152,21 @@ def start(e: Record, s: Record, m: Record) -> None:
     s.end_acceleration_m_per_s2 = 0.0
     s.macro_disturbance_n = 0.0
     s.micro_disturbance_n = 0.0
+    s.memory[:] = 0.0
     e.cycle = m.cycle
     e.started = 1.0
 
 
 @compiled
-def correct(e: Record, s: Record, q: Record, m: Record) -> None:
+def correct(e: Record, s: Record, q: Record, macro_position_m: float, end_position_m: float) -> None:
     """Take a fresh sample into the believed machine."""
-    innovation = m.macro_position_m - s.macro_position_m
+    innovation = macro_position_m - s.macro_position_m
     e.macro_innovation_m = innovation
     s.macro_position_m += e.macro_position_gain_ratio * innovation
     s.macro_velocity_m_per_s += e.macro_velocity_gain_per_s * innovation
     s.macro_disturbance_n += e.macro_force_gain_n_per_m * innovation
     if q.has_micro != 0.0:
-        innovation = m.end_position_m - s.end_position_m
+        innovation = end_position_m - s.end_position_m
         e.end_innovation_m = innovation
         s.end_position_m += e.micro_position_gain_ratio * innovation
         s.end_velocity_m_per_s += e.micro_velocity_gain_per_s * innovation
