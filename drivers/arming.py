@@ -36,6 +36,34 @@ _MAPPING_POSITION = (0x6040_00_10, 0x607A_00_20, 0x60B2_00_10)
 _MAPPING_ACTUAL = (0x6041_00_10, 0x6064_00_20, 0x6077_00_10)
 _MAPPING_INPUTS = (0x60FD_00_20,)
 
+_NEEDED = (
+    (cia402.DEVICE_TYPE, (0,)),
+    (cia402.COB_ID_SYNC, (0,)),
+    (cia402.COB_ID_EMCY, (0,)),
+    (cia402.CONSUMER_HEARTBEAT_TIME, (1,)),
+    (cia402.PRODUCER_HEARTBEAT_TIME, (0,)),
+    (cia402.IDENTITY, (0,)),
+    (cia402.RPDO_COMMUNICATION, (1, 2)),
+    (cia402.TPDO_COMMUNICATION, (1, 2)),
+    (cia402.TPDO_COMMUNICATION + 1, (1, 2, 3)),
+    (cia402.TPDO_MAPPING, (0, 1, 2, 3)),
+    (cia402.TPDO_MAPPING + 1, (0, 1)),
+    (cia402.ABORT_CONNECTION_OPTION_CODE, (0,)),
+    (cia402.CONTROLWORD, (0,)),
+    (cia402.STATUSWORD, (0,)),
+    (cia402.QUICK_STOP_OPTION_CODE, (0,)),
+    (cia402.MODES_OF_OPERATION, (0,)),
+    (cia402.MAX_TORQUE, (0,)),
+    (cia402.MOTOR_RATED_TORQUE, (0,)),
+    (cia402.QUICK_STOP_DECELERATION, (0,)),
+    (cia402.INTERPOLATION_TIME_PERIOD, (1, 2)),
+)
+_NEEDED_TO_HOME = (
+    (cia402.HOMING_METHOD, (0,)),
+    (cia402.HOMING_SPEEDS, (1, 2)),
+    (cia402.HOMING_ACCELERATION, (0,)),
+)
+
 _MODES = {"torque": cia402.MODE_CST, "position": cia402.MODE_CSP}
 _ENERGISED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia402.State.FAULT_REACTION_ACTIVE)
 _IDENTITY_NAMES = ("vendor id", "product code", "revision number", "serial number")  # 0x1018:01 .. :04
@@ -132,6 +160,14 @@ def configure(
         master.nmt(drive.node_id, "pre-operational")
         mappings.append(_configure_drive(master, drive, remark))
     return mappings
+
+
+def needed_objects(mode: Literal["torque", "position"], homes: bool) -> list[tuple[int, int]]:
+    """Return (index, subindex) of every object without which `configure`, or the drive's homing, can't be done."""
+    mapped = _MAPPING_TORQUE if mode == "torque" else _MAPPING_POSITION
+    rpdo = (cia402.RPDO_MAPPING, tuple(range(len(mapped) + 1)))
+    tables = (*_NEEDED, rpdo, *(_NEEDED_TO_HOME if homes else ()))
+    return [(index, subindex) for index, subindices in tables for subindex in subindices]
 
 
 def read_rated_values(master: "Master", node_id: int) -> RatedValues:

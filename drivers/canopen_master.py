@@ -5,17 +5,19 @@ CiA 402 state machine stay out (`drivers.pdo`, `drivers.cia402`): canopen's own 
 stage can't afford (a quick stop that enables the drive first, frames lost while waiting).
 """
 
+import configparser
 import logging
 import threading
 import time
+import warnings
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import can
 import canopen
-from canopen.objectdictionary import datatypes
+from canopen.objectdictionary import ObjectDictionary, datatypes, import_od
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from drivers import cia402
@@ -36,10 +38,12 @@ _NMT_NAMES = {
 }
 
 EMERGENCY_LOG_LENGTH = 256
+_LACKING_SHOWN = 8  # of the objects that an EDS file lacks: more would bury the sentence
 RECEIVER_PERIOD_S = 0.1  # the receiver thread notices a close after this
 
 # Its aborts and timeouts come back as our exceptions; the same text on stderr would be noise.
 logging.getLogger("canopen.sdo.client").setLevel(logging.CRITICAL)
+logging.getLogger("canopen.objectdictionary.eds").setLevel(logging.CRITICAL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +110,7 @@ class Master:
         """Make a drive known by its EDS file; ProfileError where the file can't be read. Adding again is harmless."""
         if node_id in self._nodes:
             return
-        try:
-            node = canopen.RemoteNode(node_id, str(eds_path))
-        except (OSError, ValueError, KeyError) as error:
-            raise ProfileError(
-                f"{eds_path}: EDS of node {node_id} can't be read: {error}; correct the eds key"
-            ) from error
+        node = canopen.RemoteNode(node_id, _dictionary(node_id, eds_path))
         with self._subscribers_lock:
             self.network.add_node(node)
             # canopen's consumers keep every emergency for good, and raise on frames of an unexpected length.
@@ -132,10 +131,7 @@ class Master:
 
     def has(self, node_id: int, index: int, subindex: int = 0) -> bool:
         """Return True where the node's EDS file has the object."""
-        entry = self._node(node_id).object_dictionary.get(index)
-        # Asked directly: canopen's arrays invent the members that their file doesn't list.
-        members = getattr(entry, "subindices", (0,))
-        return entry is not None and subindex in members
+        return _has(self._node(node_id).object_dictionary, index, subindex)
 
     def indices(self, node_id: int) -> list[int]:
         """Return the indices of all objects in the node's EDS file."""
@@ -203,8 +199,9 @@ class Master:
 
     def _integer_type(self, node_id: int, index: int, subindex: int) -> tuple[bool, int]:
         """Return (signed, length in bytes) of an object by its EDS file; DriveError where it isn't an integer there."""
-        variable = self._node(node_id).object_dictionary.get_variable(index, subindex)
-        if variable is None or not self.has(node_id, index, subindex):
+        dictionary = self._node(node_id).object_dictionary
+        variable = dictionary.get_variable(index, subindex)
+        if variable is None or not _has(dictionary, index, subindex):
             raise DriveError(
                 f"{_place(node_id, index, subindex)}: not in the drive's EDS file; "
                 "use the EDS of this firmware, or a drive that has the object"
@@ -275,6 +272,56 @@ class Master:
         # A payload without even a code is still an emergency: "generic error".
         code, register, vendor = cia402.decode_emergency(bytes(data)) if len(data) >= 2 else (0x1000, 0, b"")
         self._emergencies.append(Emergency(can_id - 0x080, code, register, vendor, self._clock_s()))
+
+
+def eds_problem(
+    eds_path: str | Path, node_id: int, identity: tuple[int, int], objects: Iterable[tuple[int, int]]
+) -> str:
+    """Say why an EDS file is of no use for a drive, before there is one; empty where nothing is wrong.
+
+    `identity` is (vendor id, product code); a file may leave them out, or 0. `objects` are the (index, subindex) that
+    arming reads and writes, all integers. CiA 306: VendorNumber and ProductNumber are 0x1018:01 and :02.
+    """
+    try:
+        dictionary = _dictionary(node_id, eds_path)
+    except ProfileError as error:
+        return str(error)
+    device = dictionary.device_information
+    stated = (("VendorNumber", device.vendor_number), ("ProductNumber", device.product_number))
+    for wanted, (name, found) in zip(identity, stated, strict=True):
+        if found and found != wanted:
+            return (
+                f"{eds_path}: is of another drive: {name} is 0x{found:X}, the profile's identity says 0x{wanted:X}; "
+                "take this drive's EDS, or correct identity"
+            )
+    lacking = [
+        f"0x{index:04X}:{subindex:02X}"
+        for index, subindex in objects
+        if not _has(dictionary, index, subindex)
+        or getattr(dictionary.get_variable(index, subindex), "data_type", None) not in datatypes.INTEGER_TYPES
+    ]
+    if not lacking:
+        return ""
+    more = f" and {len(lacking) - _LACKING_SHOWN} more" if len(lacking) > _LACKING_SHOWN else ""
+    shown = ", ".join(lacking[:_LACKING_SHOWN]) + more
+    return f"{eds_path}: lacks what arming needs, as integers: {shown}; take the EDS of this drive and firmware"
+
+
+def _dictionary(node_id: int, eds_path: str | Path) -> ObjectDictionary:
+    """Read an EDS file. Errors: ProfileError."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # how it says that [DeviceInfo] is absent
+            return import_od(str(eds_path), node_id)
+    except (OSError, ValueError, LookupError, AttributeError, TypeError, configparser.Error) as error:
+        reason = str(error).replace("\n", " ")
+        raise ProfileError(f"{eds_path}: EDS of node {node_id} can't be read: {reason}; correct the eds key") from error
+
+
+def _has(dictionary: ObjectDictionary, index: int, subindex: int) -> bool:
+    """Return whether the file lists it. Asked directly: canopen's arrays invent members that their file doesn't."""
+    entry = dictionary.get(index)
+    return entry is not None and subindex in getattr(entry, "subindices", (0,))
 
 
 def _place(node_id: int, index: int, subindex: int) -> str:

@@ -17,9 +17,11 @@ from stagectl.errors import LinkError
 READ_BYTES = 512
 """Most bytes of one read: 16 lines of a burst fit, and one read stays short."""
 
+_PSEUDO_TERMINALS = "/dev/pts/"
+
 _REMEDIES = {
     errno.ENOENT: "there is no such port: plug the sensor in, or correct interferometer.port (see /dev/serial/by-id)",
-    errno.EACCES: "no permission: add the user to the group dialout, or install the udev rules of deploy/",
+    errno.EACCES: "no permission: add the user to the group dialout, or give the port to your user by a udev rule",
     errno.EAGAIN: "another program holds it: stop that program (fuser shows it); two readers would share the bytes",
     errno.EBUSY: "another program holds it: stop that program (fuser shows it); two readers would share the bytes",
     errno.ENOTTY: "this is no serial port: correct interferometer.port",
@@ -49,6 +51,8 @@ class SerialPort:
         except (OSError, termios.error) as error:
             self._serial.close()
             raise LinkError(self._text("can't be configured", error)) from error
+        if os.path.realpath(self.path).startswith(_PSEUDO_TERMINALS):
+            return  # the rig's: no adapter, and nothing to collect bytes
         try:
             self._serial.set_low_latency_mode(True)
         except (OSError, ValueError) as error:
@@ -66,7 +70,7 @@ class SerialPort:
         if milliseconds > 1:
             self.warnings.append(
                 f"{self.path}: latency timer is {milliseconds} ms, so samples come in bursts that late; "
-                f"write 1 to {timer} or install the udev rules of deploy/"
+                f"write 1 to {timer}"
             )
 
     def _text(self, what: str, error: BaseException) -> str:

@@ -217,7 +217,8 @@ def main(argv: list[str] | None = None) -> int:
     os.set_blocking(wakeup_fileno, False)
     signal.set_wakeup_fd(wakeup_fileno, warn_on_full_buffer=False)
     signal.signal(signal.SIGTERM, lambda number, frame: None)  # the wake-up descriptor tells the loop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the controller: it stops the stage, then the rig
+    for number in (signal.SIGINT, signal.SIGHUP):  # for the controller: it stops the stage, then the rig
+        signal.signal(number, signal.SIG_IGN)
     try:
         machine = load_machine(arguments.machine)
         faults = _faults_from(arguments.faults)

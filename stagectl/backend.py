@@ -467,14 +467,17 @@ class HardwareBackend(RealtimeBackend):
 
 
 def ask_rig(channel: str, message: dict) -> dict:
-    """Send a request to the rig process behind a hub's socket and return its answer."""
+    """Send a request to the rig process behind a hub's socket and return its answer; LinkError where none comes."""
     asked = connect_hub(channel)
     try:
         asked.settimeout(_RIG_ANSWER_S)
         asked.send(b"FILT")
         asked.send(b"RIG " + json.dumps(message).encode())
         while not (answer := asked.recv(1 << 16)).startswith(b"RIG "):
-            pass  # frames that were under way before the filter took effect
+            if not answer:  # the end of the connection; what else comes was under way before the filter took effect
+                raise LinkError(f"rig {channel}: it ended without an answer; start it again")
+    except OSError as error:
+        raise LinkError(f"rig {channel}: no answer: {error.strerror or error}; is it still running?") from error
     finally:
         asked.close()
     return json.loads(answer.removeprefix(b"RIG "))
@@ -515,9 +518,15 @@ class RigBackend(RealtimeBackend):
         return ask_rig(self._channel, message)
 
     def truth(self) -> dict[str, np.ndarray] | None:
-        """Return the rig's log so far."""
-        if self._rig.running:
+        """Return the rig's log so far; None where the rig is dead. LinkError where it lives and does not answer."""
+        try:
             self.request({"truth": str(self._truth_path)})
+        except LinkError:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._rig.process.wait(1.0)  # of a process that is killed the socket closes first
+            if self._rig.running:
+                raise
+            return None
         with np.load(self._truth_path) as stored:
             return {name: stored[name] for name in stored.files}
 

@@ -1,5 +1,6 @@
 """The command line: arguments and help, nothing else. What a command does stands in `stagectl.commands`."""
 
+import io
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +14,9 @@ if TYPE_CHECKING:
     from stagectl.commands.answer import Answer, Voice
 
 _EXIT_CODES = (
-    "Exit codes: 0 done; 1 ended early (guard, drive, or a replay that differs); 2 wrong usage, profile or request; "
-    "3 link or drive; 4 timing; 5 run folder; 130 Ctrl-C (stage at rest, run closed)."
+    "Exit codes: 0 done; 1 ended early (a stop by guard or drive, or a replay that differs); 2 wrong usage, profile or "
+    "request; 3 link or drive; 4 timing (a step took too long); 5 run folder; 130 Ctrl-C, SIGTERM or a closed terminal "
+    "(stage at rest, run closed)."
 )
 
 
@@ -293,6 +295,8 @@ _USAGE_ERROR: Any = typer.BadParameter.__base__
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     argv = sys.argv[1:] if arguments is None else arguments
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without UTF-8 gets \xb5 for what it can't show
     try:
         code = typer.main.get_command(app).main(argv, prog_name="stagectl", standalone_mode=False)
     except _USAGE_ERROR as error:
@@ -301,7 +305,9 @@ def main(arguments: list[str] | None = None) -> int:
             import json as json_text
 
             failure = {"kind": "UsageError", "message": error.format_message()}
-            typer.echo(json_text.dumps({"exit_code": error.exit_code, "error": failure}, indent=2))
+            known = error.ctx.command_path.split()[1:] if error.ctx is not None else []
+            answer = {"command": " ".join(known), "exit_code": error.exit_code, "error": failure, "run": None}
+            typer.echo(json_text.dumps(answer, indent=2))
         return int(error.exit_code)
     except (typer.Abort, KeyboardInterrupt):  # before a command began, or behind its end
         return 130

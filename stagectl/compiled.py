@@ -7,7 +7,9 @@ cache folder of its own.
 
 import hashlib
 import os
+import stat
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -32,13 +34,44 @@ def _cache_root() -> Path:
     root = os.environ.get("STAGECTL_CACHE") or os.environ.get("XDG_CACHE_HOME")
     if os.environ.get("STAGECTL_CACHE"):
         return Path(str(root))
-    return (Path(root) if root else Path.home() / ".cache") / "stagectl"
+    return (Path(root) if root else Path("~/.cache").expanduser()) / "stagectl"
 
 
-CACHE_FOLDER = _cache_root() / _sources_hash()
-"""Holds the compiled code and the generated modules of these sources."""
+def _cache_folder(version: str) -> tuple[Path, str]:
+    """Make the folder of this version; returns it, and what to say where it is not the usual one."""
+    try:
+        usual = _cache_root() / version
+        return _made(usual), ""
+    except (OSError, RuntimeError) as error:  # RuntimeError: nobody knows a home
+        root = _own_temporary_folder()
+        os.environ["STAGECTL_CACHE"] = str(root)  # for the processes of servo and rig
+        return _made(root / version), (
+            f"compiled code can't be kept ({error}); it goes to {root}; set STAGECTL_CACHE to a folder of yours"
+        )
 
-CACHE_FOLDER.mkdir(parents=True, exist_ok=True)
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"{folder} can't be written")
+    return folder
+
+
+def _own_temporary_folder() -> Path:
+    """Return a folder that nobody else can have put code into: this user's, with no rights for others."""
+    folder = Path(tempfile.gettempdir()) / f"stagectl-cache-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700)
+    except FileExistsError:
+        found = folder.lstat()
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+            return Path(tempfile.mkdtemp(prefix="stagectl-cache-"))
+    return folder
+
+
+CACHE_FOLDER, CACHE_REMARK = _cache_folder(_sources_hash())
+"""Holds the compiled code and the generated modules of these sources; and why it is not the usual one, or empty."""
+
 numba.config.CACHE_DIR = str(CACHE_FOLDER / "numba")  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
 
 

@@ -181,6 +181,13 @@ class MacroAxis(Axis):
                 *self._axis_problems(),
                 _order_problem("travel_m", self.travel_m),
                 problem_if(
+                    low_m < high_m and not low_m < 0.0 < high_m,
+                    "travel_m",
+                    list(self.travel_m),
+                    "must hold 0, the index of the encoder, where homing ends",
+                    "measure it from there",
+                ),
+                problem_if(
                     low_m < high_m and not stopping_m < high_m - low_m,
                     "velocity_limit_m_per_s",
                     speed,

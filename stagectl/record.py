@@ -72,6 +72,11 @@ def _to_json(value: Any, indent: int | None = None) -> str:
     return json.dumps(value, default=plain, indent=indent, ensure_ascii=False)
 
 
+def _encoded(text: str) -> bytes:
+    r"""Encode JSON; bytes of a path that are no UTF-8 become JSON's \udcff."""
+    return text.encode(errors="backslashreplace")
+
+
 def _event_first(logger, method: str, event_dict):  # pyright: ignore[reportUnusedParameter]
     return {"event": event_dict.pop("event"), **event_dict}
 
@@ -83,7 +88,7 @@ class _LineSink:
         self._put = put
 
     def write(self, text: str) -> None:
-        self._put(text.encode())
+        self._put(_encoded(text))
 
     def flush(self) -> None:
         """Do nothing: `write` has put the line into the file."""
@@ -238,7 +243,7 @@ class Recorder:
         self._events.write_held()
 
     def _write_manifest(self) -> None:
-        replace_whole(self.folder / MANIFEST, _to_json(self.manifest, indent=2).encode())
+        replace_whole(self.folder / MANIFEST, _encoded(_to_json(self.manifest, indent=2)))
 
     def _write(self, action: Callable[[], None]) -> None:
         try:
@@ -296,6 +301,11 @@ class Run:
     unknown_fields: tuple[str, ...]
     """Fields of the file that this version does not know; their values are not in `rows`."""
 
+    @property
+    def rows_missing_count(self) -> int:
+        """Rows that the manifest counts and the file no longer has."""
+        return max(0, self.manifest.get("record", {}).get("rows_count", 0) - len(self.rows))
+
 
 def read_manifest(folder: Path) -> dict:
     """Return a run's manifest. Errors: RecordError."""
@@ -304,14 +314,40 @@ def read_manifest(folder: Path) -> dict:
         manifest = json.loads(path.read_bytes())
     except FileNotFoundError as error:
         raise RecordError(f"{folder}: not a run folder (no {MANIFEST}); `stagectl runs list` shows the runs") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RecordError(f"{path}: can't be read: {error}; the other files of the run are not affected") from error
     if not isinstance(manifest, dict):
         raise RecordError(f"{path}: holds a {type(manifest).__name__} and not a table; it is not ours")
-    found = manifest.get("record", {}).get("format", FORMAT)
+    record = manifest.get("record")
+    found = record.get("format", FORMAT) if isinstance(record, dict) else FORMAT
     if found != FORMAT:
         raise RecordError(f"{path}: run format {found}, this version reads {FORMAT}; use the version that made it")
+    _check_manifest(manifest, path)
     return manifest
+
+
+def _check_manifest(manifest: dict, path: Path) -> None:
+    """Refuse what a recorder never writes, so that readers need not doubt what they find. Errors: RecordError."""
+    tables: list[tuple[str, dict, str, type]] = [(name, manifest, name, dict) for name in ("record", "end", "mappings")]
+    record, profile = manifest.get("record"), manifest.get("profile")
+    if isinstance(record, dict):
+        tables += [(f"record.{name}", record, name, int) for name in ("rows_count", "first_t_ns", "last_t_ns")]
+        tables.append(("record.state", record, "state", str))
+    if isinstance(profile, dict):
+        tables.append(("profile.cycle", profile, "cycle", dict))
+    for place, table, name, kind in tables:
+        if name not in table or type(table[name]) is kind:
+            continue
+        if table[name] is None and name in ("first_t_ns", "last_t_ns"):  # of a run without rows
+            continue
+        shown = json.dumps(table[name])
+        raise RecordError(
+            f"{path}: {place} is {shown if len(shown) < 40 else f'{shown[:40]}...'}, and a recorder writes "
+            f"{_KINDS[kind]} there; the file is damaged: take it from a copy of the run"
+        )
+
+
+_KINDS = {dict: "a table", int: "a whole number", str: "a text"}
 
 
 def read_batches(folder: Path) -> Iterator[np.ndarray]:
@@ -362,7 +398,7 @@ def read_run(folder: Path) -> Run:
 
 
 def _read_events(path: Path) -> tuple[list[dict], bool]:
-    """Return the whole events, and whether a half one follows them."""
+    """Return the whole events, and whether something follows them that is none."""
     if not path.exists():
         return [], True
     events = []
@@ -373,9 +409,12 @@ def _read_events(path: Path) -> tuple[list[dict], bool]:
     lines = content.split(b"\n")
     for line in lines[:-1]:
         try:
-            events.append(json.loads(line))
-        except ValueError:
+            event = json.loads(line)
+        except (ValueError, RecursionError):
             return events, True
+        if not isinstance(event, dict) or not isinstance(event.get("event"), str):
+            return events, True
+        events.append(event)
     return events, lines[-1] != b""
 
 
@@ -495,7 +534,7 @@ def _finish_recovered(folder: Path, manifest: dict, recovery: Recovery) -> None:
     finally:
         events.close()
     manifest["record"] = {**manifest.get("record", {}), **state}
-    replace_whole(folder / MANIFEST, _to_json(manifest, indent=2).encode())
+    replace_whole(folder / MANIFEST, _encoded(_to_json(manifest, indent=2)))
     (folder / _RESERVE).unlink(missing_ok=True)
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from drivers.arming import DriveMapping
 from drivers.pdo import Codec
 from drivers.wire import Inbox, WireDecoder
-from stagectl.errors import RecordError
+from stagectl.errors import LinkError, RecordError
 from stagectl.fields import fields
 from stagectl.plant import PLANT_PARAMETERS
-from stagectl.record import SNAPSHOT, Run, read_run
+from stagectl.record import MANIFEST, SNAPSHOT, Run, read_run
 from stagectl.requests import TICKING, Phase
-from stagectl.runs import profile_of
+from stagectl.runs import missing_text, profile_of
 from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT
 from stagectl.tracker import Tracker
 
@@ -64,13 +64,28 @@ def mapping_of(table: Mapping[str, Any]) -> DriveMapping:
     return DriveMapping(**values)
 
 
+def mappings_of(run: Run) -> dict[str, DriveMapping]:
+    """Make the mappings of a run's drives. Errors: RecordError."""
+    try:
+        return {axis: mapping_of(table) for axis, table in run.manifest["mappings"].items()}
+    except (KeyError, TypeError, ValueError, LinkError) as error:
+        raise RecordError(
+            f"{run.folder / MANIFEST}: mappings are damaged ({type(error).__name__}: {error}); "
+            "take the file from a copy of the run"
+        ) from error
+
+
 def replay(folder: str | Path) -> Comparison:
-    """Replay a run folder; RecordError where it lacks what a replay needs."""
-    return replay_run(read_run(Path(folder)))
+    """Replay a run folder; RecordError where it lacks what a replay needs, rows that the manifest counts included."""
+    run = read_run(Path(folder))
+    if run.rows_missing_count:
+        missing = missing_text(run.rows_missing_count, run.rows_missing_count + len(run.rows))
+        raise RecordError(f"{run.folder}: {missing}; nothing to replay as a whole: take the file from a copy")
+    return replay_run(run)
 
 
 def replay_run(run: Run) -> Comparison:
-    """Replay a run that was read."""
+    """Replay a run that was read, or as many of its rows as are given."""
     manifest = run.manifest
     if "mappings" not in manifest or not run.snapshot:
         raise RecordError(
@@ -82,7 +97,7 @@ def replay_run(run: Run) -> Comparison:
             f"{run.folder}: the run has no rows, so nothing to replay; `stagectl runs show` says how it ended"
         )
     profile = profile_of(run)
-    mappings = {axis: mapping_of(table) for axis, table in manifest["mappings"].items()}
+    mappings = mappings_of(run)
     decoder = WireDecoder(profile, mappings)
     decoder.restore(run.snapshot)
     tracker = Tracker(profile, has_drives=True)

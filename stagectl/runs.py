@@ -3,6 +3,7 @@
 Reads no clock but the one that names a new folder.
 """
 
+import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -20,7 +21,7 @@ from stagectl.errors import RecordError, RequestError
 from stagectl.profile import Profile
 from stagectl.record import MANIFEST, SAMPLES, Run, free_text, read_batches, read_manifest, read_run, recorded_fields
 from stagectl.row import ROW
-from stagectl.samples_file import schema_of, to_batch
+from stagectl.samples_file import END_MARKER, schema_of, to_batch
 from stagectl.signals import Stop, stop_sentence
 from stagectl.suggestion import closest
 from stagectl.table_import import Imported, import_table
@@ -97,6 +98,7 @@ def _summary(folder: Path) -> RunSummary:
         state = record.get("state", "")
         count, first_t_ns, last_t_ns = record.get("rows_count", 0), record.get("first_t_ns"), record.get("last_t_ns")
         stop, text = ending(manifest)
+        note = ""
         if state == "recording":
             state = "recording" if is_held(folder / SAMPLES) else "crashed"
             count = 0
@@ -104,10 +106,29 @@ def _summary(folder: Path) -> RunSummary:
                 first_t_ns = int(rows["t_ns"][0]) if first_t_ns is None else first_t_ns
                 last_t_ns = int(rows["t_ns"][-1])
                 count += len(rows)
+        elif count and not _has_end(folder / SAMPLES):
+            found = sum(len(rows) for rows in read_batches(folder)) if (folder / SAMPLES).exists() else 0
+            if found < count:
+                state, note, count = "damaged", missing_text(count - found, count), found
     except RecordError as error:
         return RunSummary(folder, "damaged", 0, 0.0, "", "", "", str(error))
     duration_s = 0.0 if first_t_ns is None or last_t_ns is None else (last_t_ns - first_t_ns) * 1e-9
-    return RunSummary(folder, state, count, duration_s, _profile_name(manifest), stop, text)
+    return RunSummary(folder, state, count, duration_s, _profile_name(manifest), stop, text, note)
+
+
+def _has_end(path: Path) -> bool:
+    """Tell whether a samples file ends as a closed one does, without reading its rows."""
+    try:
+        with open(path, "rb") as file:
+            file.seek(-len(END_MARKER), os.SEEK_END)
+            return file.read() == END_MARKER
+    except OSError:  # missing, or shorter than that
+        return False
+
+
+def missing_text(missing_count: int, rows_count: int) -> str:
+    """Say how many rows of a run its file has lost."""
+    return f"{missing_count} of {rows_count} rows are missing: {SAMPLES} was cut, damaged or deleted"
 
 
 def _profile_name(manifest: dict) -> str:
@@ -147,13 +168,18 @@ def show(folder: Path) -> dict[str, Any]:
     run = read_run(folder)
     rows = run.rows
     summary = _summary(run.folder)
+    missing_count, note = run.rows_missing_count, summary.note
+    if missing_count:
+        note = missing_text(missing_count, missing_count + len(rows))
     description: dict[str, Any] = {
         "folder": str(run.folder),
-        "state": summary.state,
+        "state": "damaged" if missing_count else summary.state,
+        "note": note,
         "profile": summary.profile,
         "stop": summary.stop,
         "text": summary.text,
         "rows_count": len(rows),
+        "rows_missing_count": missing_count,
         "duration_s": float((rows["t_ns"][-1] - rows["t_ns"][0]) * 1e-9) if len(rows) else 0.0,
         "truncated": run.truncated,
         "missing_fields": list(run.missing_fields),
@@ -188,7 +214,7 @@ def export(folder: Path, format: str, columns: Sequence[str] | None = None, out:
 
     Nothing is rounded: CSV numbers read back to the same bits, raw bytes are hex there, and unsigned bytes (n, width)
     in mat. `columns` are ROW fields (default: all that the run has).
-    Errors: RequestError (format, column), RecordError (no run, full disk).
+    Errors: RequestError (format, column, `out` is no file), RecordError (no run, full disk).
     """
     if format not in FORMATS:
         raise RequestError(f"export format {format!r}: choose one of {', '.join(FORMATS)}")
@@ -204,6 +230,9 @@ def export(folder: Path, format: str, columns: Sequence[str] | None = None, out:
     if len(set(names)) != len(names):
         raise RequestError(f"{folder}: a column is asked for twice in {', '.join(names)}; name each once")
     target = Path(out) if out is not None else folder / f"samples.{format}"
+    if os.path.exists(target) and not os.path.isfile(target):  # replacing a device or a pipe would remove it
+        what = "a folder" if target.is_dir() else "a device, a pipe or a socket"
+        raise RequestError(f"--out {str(out)!r}: {target} is {what}; give the path of a file, new or to be replaced")
     writers = {"csv": _write_csv, "parquet": _write_parquet, "mat": _write_mat}
     with _whole_target(target) as unborn:
         writers[format](folder, names, unborn)
@@ -251,7 +280,7 @@ def _write_parquet(folder: Path, names: list[str], target: Path) -> None:
 
     schema = schema_of(names)
     group_rows_count = 16_384  # row groups of 16 s: batches of 0.2 s would make a file of mostly footers
-    with parquet.ParquetWriter(target, schema) as writer:
+    with open(target, "wb") as file, parquet.ParquetWriter(file, schema) as writer:  # Arrow's paths are UTF-8
         waiting: list[pa.RecordBatch] = []
         for rows in read_batches(folder):
             waiting.append(to_batch(rows, schema))

@@ -74,8 +74,8 @@ def encode_batch(batch: pa.RecordBatch) -> bytes:
 def scan(path: Path) -> Iterator[Piece]:
     """Yield the schema, then every whole batch of the file; ends silently where it is cut or damaged."""
     try:
-        with pa.OSFile(str(path)) as file:
-            messages = pa.ipc.MessageReader.open_stream(file)
+        with open(path, "rb") as file:  # Arrow opens no path that is not UTF-8; nothing is read ahead, so tell() holds
+            messages = pa.ipc.MessageReader.open_stream(pa.PythonFile(file, mode="r"))
             schema = None
             while True:
                 try:

@@ -11,7 +11,7 @@ import numpy as np
 from drivers.wire import WireDecoder
 from stagectl.errors import RecordError
 from stagectl.record import Run
-from stagectl.replay import mapping_of
+from stagectl.replay import mappings_of
 from stagectl.runs import profile_of
 
 
@@ -32,7 +32,7 @@ def score(run: Run, truth: dict[str, np.ndarray], first_row: int, rows_count: in
     """Join rows and truth by the sensor's sequence number; RecordError where the truth lacks a row's sample."""
     rows = run.rows[first_row : first_row + rows_count]
     profile = profile_of(run)
-    mappings = {axis: mapping_of(table) for axis, table in run.manifest["mappings"].items()}
+    mappings = mappings_of(run)
     decoder = WireDecoder(profile, mappings)
     place = np.searchsorted(truth["sequence"], rows["cycle"])
     place = np.minimum(place, truth["sequence"].size - 1)

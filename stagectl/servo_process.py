@@ -202,7 +202,11 @@ def _run(servo: Servo) -> bool:
 
 def main() -> int:
     """Read the two lines of configuration and serve; errors come out as one JSON line."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the supervisor's: it asks for a stop
+    for number in (
+        signal.SIGINT,
+        signal.SIGHUP,
+    ):  # Ctrl-C and a closed terminal are the supervisor's: it asks for a stop
+        signal.signal(number, signal.SIG_IGN)
     try:
         profile = profile_from_effective(json.loads(sys.stdin.readline()), "the supervisor's profile")
         _warm(profile)

@@ -123,7 +123,7 @@ STOP_TEXT = {
     Stop.SUPERVISOR_SILENT: "the supervisor's counter stands still",
     Stop.COMMAND_LOST: "commands could not be put on the bus",
     Stop.MEASUREMENT_NOT_FINITE: "a measured position is not a finite number",
-    Stop.LINK_LOST: "the bus or the interferometer's port is gone, or speaks another layout",
+    Stop.LINK_LOST: "a link that the stage needs is lost",
     Stop.HEARTBEAT_LOST: "a drive sends no heartbeat",
     Stop.RECORD_LOST: "the run can't be written to its disk",
     Stop.SAMPLE_AHEAD: "the newest interferometer sample lies in the future",

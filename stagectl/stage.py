@@ -9,7 +9,7 @@ from sim_backend.machine import load_machine, machine_path_for
 from stagectl.backend import BatchBackend, HardwareBackend, RigBackend
 from stagectl.errors import LinkError, RequestError
 from stagectl.profile import Profile
-from stagectl.runs import new_run_folder
+from stagectl.run_folder import reserve
 from stagectl.supervisor import Progress, Supervisor
 
 BACKENDS = ("auto", "hardware", "rig", "batch")
@@ -60,7 +60,10 @@ def open_stage(
     progress: Progress = lambda what, share: None,
     manifest: dict[str, Any] | None = None,
 ) -> Supervisor:
-    """Open the world and return its supervisor; entering that configures the drives and starts the servo."""
+    """Open the world and return its supervisor; entering that configures the drives and starts the servo.
+
+    Makes the run's folder: whoever leaves it empty gives it back (`run_folder.give_back`).
+    """
     chosen = choose(profile, backend)
     truth_of = machine if machine is not None else machine_path_for(profile.name)
     progress(f"opening {chosen}", 0.0)
@@ -78,4 +81,9 @@ def open_stage(
         "backend_asked": backend,
         "seeds": [seed],
     }
-    return Supervisor(profile, world, new_run_folder(runs_root, name), progress, facts)
+    try:
+        folder = reserve(runs_root, name)
+    except BaseException:
+        world.close()
+        raise
+    return Supervisor(profile, world, folder, progress, facts)

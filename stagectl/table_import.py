@@ -3,6 +3,7 @@
 Reads no clock.
 """
 
+import codecs
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -286,16 +287,18 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     import pyarrow.csv as arrow_csv
 
     remarks = []
+    _check_encoding(path)
     try:
         with open(path, encoding="utf-8-sig", errors="replace") as file:
             header = file.readline()
         delimiter = max(",;\t", key=header.count)
         decimal_point = "," if delimiter == ";" and _has_decimal_commas(path) else "."
-        table = arrow_csv.read_csv(
-            path,
-            parse_options=arrow_csv.ParseOptions(delimiter=delimiter),
-            convert_options=arrow_csv.ConvertOptions(decimal_point=decimal_point, strings_can_be_null=True),
-        )
+        with open(path, "rb") as content:  # Arrow opens no path that is not UTF-8
+            table = arrow_csv.read_csv(
+                content,
+                parse_options=arrow_csv.ParseOptions(delimiter=delimiter),
+                convert_options=arrow_csv.ConvertOptions(decimal_point=decimal_point, strings_can_be_null=True),
+            )
     except OSError as error:
         raise RecordError(f"{path}: can't be read: {error.strerror or error}; check path and permissions") from error
     except pa.ArrowInvalid as error:
@@ -311,6 +314,24 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
         if names.count(name) > 1:
             raise RecordError(f"{path}: two columns are called {name!r}; rename one")
     return {name: _numbers(column) for name, column in zip(names, table.columns, strict=True)}, remarks
+
+
+def _check_encoding(path: Path) -> None:
+    """Refuse a table whose header is not UTF-8. Errors: RecordError."""
+    try:
+        with open(path, "rb") as file:
+            header = file.readline(1 << 20)
+    except OSError as error:
+        raise RecordError(f"{path}: can't be read: {error.strerror or error}; check path and permissions") from error
+    if header.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in header:
+        raise RecordError(f"{path}: looks like UTF-16, not UTF-8; save as UTF-8 (in a spreadsheet: CSV UTF-8)")
+    try:
+        header.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise RecordError(
+            f"{path}: byte 0x{header[error.start]:02X} in the header, behind "
+            f"{header[: error.start].decode(errors='replace')!r}, is not UTF-8 (Latin-1?); save as UTF-8"
+        ) from error
 
 
 def _numbers(column: pa.ChunkedArray) -> np.ndarray:

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Put off SIGINT, SIGTERM and SIGALRM; outside the main thread, which alone handles signals, do nothing."""
+    """Put off SIGINT, SIGTERM, SIGHUP and SIGALRM; outside the main thread, which alone handles signals, do nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

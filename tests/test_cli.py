@@ -1,13 +1,18 @@
 """The command line: what it prints, what its exit codes mean, that one run goes from command to report and replay."""
 
 import html
+import itertools
 import json
 import os
+import pty
 import re
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +20,21 @@ import pytest
 
 from sim_backend.faults import Fault
 from sim_backend.machine import load_machine
-from stagectl import cli, demo
+from stagectl import cli, demo, run_folder
 from stagectl.backend import BatchBackend
 from stagectl.commands.answer import EXIT_CODES, Answer, deliver, jsonable
+from stagectl.commands.interruption import Interruption
 from stagectl.errors import DriveError, LinkError, ProfileError, RecordError, RequestError, StagectlError, TimingError
-from stagectl.profile import load_profile
+from stagectl.profile import PROFILES_FOLDER, load_profile
 from stagectl.record import read_manifest, read_run
 from stagectl.requests import Phase
 from stagectl.run_page import page, scores_of
 from stagectl.run_scores import read_truth, score_backlash, segments
+from stagectl.runs import new_run_folder
 from stagectl.signals import Stop
 from stagectl.supervisor import Supervisor
 from stagectl.trajectory import trapezoid
+from tests.toml_text import changed
 
 COMMANDS = [
     [],
@@ -119,6 +127,12 @@ def test_wrong_usage_is_2(capsys, arguments):
     code, answer, _ = call_json(capsys, *arguments)
     assert code == answer["exit_code"] == 2
     assert answer["error"]["kind"] == "UsageError"
+    command = (
+        ""
+        if arguments[0] == "fly"
+        else " ".join(word for word in arguments[:2] if word in ("jog", "demo", "runs", "show"))
+    )
+    assert (answer["command"], answer["run"]) == (command, None)
 
 
 @pytest.mark.parametrize(
@@ -131,9 +145,25 @@ def test_wrong_usage_is_2(capsys, arguments):
         (["run", "--trajectory", "move"], "needs --target-m"),
         (["run", "--trajectory", "move", "--target-m", "0.5"], "--target-m is 0.5, the travel of oled-printer is"),
         (["run", "--trajectory", "move", "--target-m", "nan"], "--target-m is nan"),
-        (["run", "--velocity-m-per-s", "-0.1", "--backend", "plant"], "velocity_m_per_s is -0.1"),
-        (["run", "--stroke-m", "nan", "--backend", "plant"], "stroke_m is nan"),
+        (["run", "--velocity-m-per-s", "-0.1", "--backend", "plant"], "--velocity-m-per-s is -0.1"),
+        (["run", "--stroke-m", "nan", "--backend", "plant"], "--stroke-m is nan"),
         (["run", "--trajectory", "sine", "--frequency-hz", "-1", "--backend", "plant"], "--frequency-hz is -1"),
+        (
+            ["run", "--trajectory", "sine", "--frequency-hz", "1e6"],
+            "--frequency-hz is 1e+06: setpoints come at 1000 Hz",
+        ),
+        (["run", "--trajectory", "sine", "--frequency-hz", "50.1"], "up to 50 Hz"),
+        (["run", "--trajectory", "sine", "--frequency-hz", "1e-300"], "--frequency-hz is 1e-300: three periods take"),
+        (["run", "--trajectory", "sine", "--amplitude-m", "inf"], "--amplitude-m is inf: the travel of oled-printer"),
+        (["run", "--trajectory", "sine", "--amplitude-m", "1e308"], "--amplitude-m is 1e+308: the travel"),
+        (["run", "--trajectory", "sine", "--amplitude-m", "1e-300"], "--amplitude-m is 1e-300: at 0.2 m/s"),
+        (["run", "--trajectory", "sine", "--duration-s", "nan"], "--duration-s is nan: give a time above 0"),
+        (["run", "--trajectory", "sine", "--duration-s", "1e308"], "--duration-s is 1e+308: give a time above 0"),
+        (["run", "--trajectory", "sine", "--duration-s", "0.5"], "--duration-s is 0.5: the ramps at both ends"),
+        (["run", "--trajectory", "sine", "--start-m", "-inf"], "--start-m is -inf: the travel"),
+        (["run", "--velocity-m-per-s", "1e308"], "--velocity-m-per-s is 1e+308: the limit of oled-printer"),
+        (["run", "--velocity-m-per-s", "1e-300"], "--velocity-m-per-s is 1e-300: 0.8 m take"),
+        (["run", "--dwell-s", "1e308"], "--dwell-s is 1e+308: give 0 or more"),
         (["run", "--trajectory", "absent.csv", "--backend", "plant"], "absent.csv"),
         (["home", "--backend", "plant"], "take --backend rig"),
         (["identify", "--profile", "single-axis", "--backend", "plant"], "no backlash to identify"),
@@ -199,6 +229,28 @@ def test_hardware_that_is_not_there_is_3(capsys, tmp_path):
     assert answer["error"]["kind"] == "LinkError"
 
 
+def test_a_rig_that_is_killed_ends_a_jog_with_3(tmp_path):
+    command = [sys.executable, "-m", "stagectl.cli", "jog", "--distance-m", "0.1", "--backend", "rig", "--json"]
+    process = subprocess.Popen(
+        [*command, "--runs", str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    said = []
+    for line in process.stderr:
+        said.append(line)
+        if line.startswith("homing the macro"):  # its first motion
+            children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+            (rig,) = [pid for pid in children if b"sim_backend" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+            os.kill(int(rig), signal.SIGKILL)
+            break
+    out, err = process.communicate(timeout=60)
+    said = "".join(said) + err
+    assert "Traceback" not in said
+    assert process.returncode == 3, said
+    answer = json.loads(out)
+    assert (answer["exit_code"], answer["stop"]) == (3, "LINK_LOST")
+    assert not read_run(Path(answer["run"])).truncated
+
+
 def test_markup_in_a_message_stays_text(capsys):
     def work(voice):
         raise RequestError("key [red]limits[/red] of [macro]")
@@ -225,7 +277,8 @@ def test_an_answer_carries_its_exit_code(capsys):
 
 def test_the_demo_finishes_and_names_run_and_report(demo_run):
     answer, err = demo_run
-    assert answer["stop"] == "FINISHED"
+    assert (answer["stop"], answer["finished"]) == ("FINISHED", True)
+    assert answer["text"] == "trapezoid under dsmc: the reference came to its end"
     assert answer["repeated"] == []
     page = Path(answer["report"]).read_text(encoding="utf-8")
     for title in ("Tracking error", "Holding still", "The joint, identified", "Identification", "Timing"):
@@ -526,6 +579,83 @@ def test_profiles_are_listed_checked_and_shown(capsys):
     assert "pid_bandwidth_hz = 50" in call(capsys, "profile", "show", "oled-printer")[1]
 
 
+# ---- an environment that lacks something ---------------------------------------------------------------------------
+
+
+def run_in(environment, *arguments):
+    """Run a command in a process of its own with these variables."""
+    return subprocess.run(
+        [sys.executable, "-m", "stagectl.cli", *map(str, arguments)],
+        capture_output=True,
+        timeout=100,
+        env={**os.environ, **environment},
+    )
+
+
+def test_json_for_an_output_without_utf_8_is_ascii(tmp_path):
+    root = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    (root / "µ").mkdir(parents=True)
+    for encoding in ("ascii", "latin-1", "utf-8"):
+        found = run_in({"PYTHONIOENCODING": encoding}, "runs", "list", "--runs", root, "--json")
+        assert found.returncode == 0, found.stderr
+        assert json.loads(found.stdout.decode("ascii"))["runs"][0]["folder"] == str(root / "µ")
+    shown = run_in({"PYTHONIOENCODING": "ascii"}, "runs", "list", "--runs", root)
+    assert shown.returncode == 0, shown.stderr
+    assert b"\\xb5" in shown.stdout
+
+
+@pytest.mark.parametrize("variables", [{"HOME": "/proc"}, {"XDG_CACHE_HOME": "/proc/x"}, {"STAGECTL_CACHE": "FILE"}])
+def test_without_a_cache_folder_compiled_code_goes_to_a_folder_of_one_s_own(tmp_path, variables):
+    (tmp_path / "file").write_text("")
+    variables = {name: value.replace("FILE", str(tmp_path / "file")) for name, value in variables.items()}
+    environment = {"XDG_CACHE_HOME": "", "STAGECTL_CACHE": "", "TMPDIR": str(tmp_path), **variables}
+    found = run_in(environment, "profile", "list", "--json")
+    assert found.returncode == 0, found.stderr
+    json.loads(found.stdout)
+    own = tmp_path / f"stagectl-cache-{os.getuid()}"
+    assert found.stderr.decode().count(f"it goes to {own}") == 1
+    assert own.stat().st_mode & 0o777 == 0o700
+    own.chmod(0o777)  # where others may write, others may have put code
+    other = run_in(environment, "profile", "list").stderr.decode()
+    assert f"it goes to {own}" not in other
+    assert "it goes to" in other
+
+
+EDS_FILES = {
+    "noise": (bytes(range(256)), "EDS of node 1 can't be read"),
+    "text": (b"hello\n", "EDS of node 1 can't be read"),
+    "nothing": (b"", "lacks what arming needs, as integers: 0x1000:00, 0x1005:00"),
+    "the other drive's": ((PROFILES_FOLDER / "stagectl-voice-coil.eds").read_bytes(), "ProductNumber is 0x10002"),
+    "one without homing": (
+        (PROFILES_FOLDER / "stagectl-linear-motor.eds").read_bytes().replace(b"[6098]", b"[2098]"),
+        "lacks what arming needs, as integers: 0x6098:00;",
+    ),
+}
+
+
+@pytest.mark.parametrize(("content", "says"), EDS_FILES.values(), ids=EDS_FILES)
+def test_an_eds_file_that_arming_could_not_use_is_refused(capsys, tmp_path, content, says):
+    (tmp_path / "bench.toml").write_text(changed(PROFILES_FOLDER / "oled-printer.toml", {"macro.eds": "odd.eds"}))
+    (tmp_path / "odd.eds").write_bytes(content)
+    code, answer, _ = call_json(capsys, "profile", "check", tmp_path / "bench.toml")
+    assert (code, answer["error"]["kind"]) == (2, "ProfileError")
+    (line,) = answer["error"]["message"].splitlines()
+    assert line.startswith(f'{tmp_path / "bench.toml"}: macro.eds = "odd.eds": {tmp_path / "odd.eds"}: ')
+    assert says in line
+
+
+def test_an_effect_that_stands_twice_is_remarked(capsys, tmp_path):
+    text = (PROFILES_FOLDER / "oled-printer.toml").read_text()
+    effects = text[text.index("[[effects]]") :]
+    first = "[[effects]]" + effects.split("[[effects]]")[1]
+    (tmp_path / "bench.toml").write_text(f"{text}\n{first}")
+    code, answer, _ = call_json(capsys, "profile", "check", tmp_path / "bench.toml")
+    assert code == 0
+    (remark,) = answer["remarks"]
+    assert re.match(r"effects\[3\] is viscous_friction on \w+, as effects\[0\] is: both act", remark)
+    assert call_json(capsys, "profile", "check", "oled-printer")[1]["remarks"] == []
+
+
 # ---- Ctrl-C -------------------------------------------------------------------------------------------------------
 
 
@@ -558,7 +688,60 @@ def test_an_interrupt_brings_the_stage_to_rest_and_closes_the_run(tmp_path):
     assert abs(truth["macro_velocity_m_per_s"][at_rest][0]) < 1e-3
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_closed_terminal_brings_the_stage_to_rest_and_closes_the_run(tmp_path):
+    """stdin, stdout and stderr end with the terminal; what would be said there must not end the way to rest."""
+    command = [sys.executable, "-m", "stagectl.cli", "run", "--backend", "batch", "--runs", str(tmp_path)]
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execv(sys.executable, command)
+    said = b""
+    while b"moving to" not in said:
+        said += os.read(terminal, 4096)
+    time.sleep(0.3)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 130
+    (folder,) = tmp_path.iterdir()
+    run = read_run(folder)
+    assert not run.truncated
+    assert (run.manifest["end"]["stop"], run.manifest["record"]["state"]) == ("OPERATOR", "closed")
+    powered = run.rows[run.rows["run_phase"] == int(Phase.STOPPING)]
+    assert powered.size
+    assert powered["setpoint_velocity_m_per_s"][-1] == 0.0
+
+
+def test_a_hangup_that_was_to_be_ignored_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup
+    try:
+        with Interruption() as interruption:
+            os.kill(os.getpid(), signal.SIGHUP)
+            interruption.check()
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_commands_of_one_second_get_a_folder_each(tmp_path, monkeypatch):
+    """As two commands race: both have looked, and neither has made its folder."""
+    both_looked, looks = threading.Barrier(2), itertools.count()
+
+    def look(root, name):
+        folder = new_run_folder(root, name, datetime(2026, 11, 20, tzinfo=UTC))
+        if next(looks) < 2:
+            both_looked.wait(60.0)
+        return folder
+
+    monkeypatch.setattr(run_folder, "new_run_folder", look)
+    with ThreadPoolExecutor(2) as pool:
+        folders = sorted(pool.map(lambda _: run_folder.reserve(tmp_path, "home"), range(2)))
+    assert folders == sorted(tmp_path.iterdir())
+    assert [folder.name for folder in folders] == ["2026-11-20T00-00-00-home", "2026-11-20T00-00-00-home-2"]
+    (folders[0] / "manifest.json").write_text("{}")
+    for folder in folders:
+        run_folder.give_back(folder)
+    assert list(tmp_path.iterdir()) == [folders[0]]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_is_heard_where_nothing_is_half_done(capsys, tmp_path, number):
     done = []
 

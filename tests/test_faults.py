@@ -480,11 +480,11 @@ def test_a_missing_heartbeat_refuses_to_enable(tmp_path, oled_profile, oled_mach
 
 
 def test_a_stage_outside_its_travel_is_not_moved(tmp_path, oled_profile, oled_machine):
-    profile = with_values(oled_profile, macro__travel_m=(0.1, 0.4))
+    profile = with_values(oled_profile, macro__travel_m=(-0.4, 0.005))
     one = Stage(tmp_path / "run", profile, oled_machine)
     with one:
         assert one.stage.enable() is Stop.TRAVEL
-        assert re.search(r"macro at 0\.01\d+ m, travel 0\.1 \.\. 0\.4 m; move it back", one.stage.detail)
+        assert re.search(r"macro at 0\.01\d+ m, travel -0\.4 \.\. 0\.005 m; move it back", one.stage.detail)
     assert replay(tmp_path / "run").exact
 
 

@@ -422,6 +422,8 @@ CONTRADICTIONS = [
     ),
     ({"macro.homing.speed_m_per_s": 0.6}, "macro.homing.speed_m_per_s", "above velocity_limit_m_per_s = 0.5"),
     ({"macro.acceleration_limit_m_per_s2": 20.0}, "macro.acceleration_limit_m_per_s2", "110 kg so takes 2200 N"),
+    ({"macro.travel_m": [0.1, 0.45]}, "macro.travel_m", "must hold 0, the index of the encoder, where homing ends"),
+    ({"macro.travel_m": [0.0, 0.45]}, "macro.travel_m", "must hold 0"),
     ({"micro.stop": "ramp"}, "micro.stop", "without an encoder can't ramp"),
     ({"micro.stroke_m": [0.0001, 0.001]}, "micro.stroke_m", "must hold 0"),
     # right edge: 176 um + 4 N / 9.87 N/mm = 581 um to reach

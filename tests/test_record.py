@@ -289,6 +289,66 @@ def test_half_an_event_is_left_out(tmp_path):
     assert run.truncated
 
 
+@pytest.mark.parametrize("line", [b"1", b"[]", b"null", b'"text"', b"{}", b'{"event": []}', b"[" * 100_000])
+def test_a_line_that_is_no_event_ends_the_events(tmp_path, line):
+    with Recorder(tmp_path / "run", {}) as recorder:
+        recorder.event("one", 1)
+    path = tmp_path / "run" / "events.jsonl"
+    path.write_bytes(path.read_bytes() + line + b"\n" + path.read_bytes())
+    run = read_run(tmp_path / "run")
+    assert [event["event"] for event in run.events] == ["one"]
+    assert run.truncated
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("record", None), ("record", []), ("end", None), ("end", -1), ("mappings", None), ("profile", {"cycle": None})],
+)
+def test_a_manifest_that_no_recorder_writes_is_refused(tmp_path, name, value):
+    with Recorder(tmp_path / "run", {}):
+        pass
+    path = tmp_path / "run" / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
+    with pytest.raises(RecordError, match=rf"manifest\.json: {name}.* is .*; the file is damaged"):
+        read_manifest(tmp_path / "run")
+
+
+@pytest.mark.parametrize("name", ["rows_count", "first_t_ns", "last_t_ns", "state", "format"])
+def test_a_record_with_a_value_of_another_kind_is_refused(tmp_path, name):
+    with Recorder(tmp_path / "run", {}):
+        pass
+    path = tmp_path / "run" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["record"][name] = ["odd"]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(RecordError, match=r"manifest\.json"):
+        read_manifest(tmp_path / "run")
+
+
+def test_a_folder_whose_name_is_no_utf_8_holds_a_run(tmp_path):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    rows = noisy_rows(700)
+    with Recorder(folder, {"profile_path": str(folder)}) as recorder:
+        recorder.event("imported", 1, source=folder)
+        recorder.append(rows)
+    run = read_run(folder)
+    assert run.rows.tobytes() == rows.tobytes()
+    assert not run.truncated
+    assert run.manifest["profile_path"] == run.events[0]["source"] == str(folder)
+
+
+def test_rows_that_the_file_lost_are_counted(tmp_path):
+    with Recorder(tmp_path / "run", {}) as recorder:
+        recorder.append(noisy_rows(700))
+    assert read_run(tmp_path / "run").rows_missing_count == 0
+    path = tmp_path / "run" / "samples.arrow"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    run = read_run(tmp_path / "run")
+    assert run.rows_missing_count == 700 - len(run.rows) > 0
+    path.unlink()
+    assert read_run(tmp_path / "run").rows_missing_count == 700
+
+
 def test_a_run_of_another_version_is_read_by_name(tmp_path):
     rows = noisy_rows(10)
     with Recorder(tmp_path / "run", {}) as recorder:

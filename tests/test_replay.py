@@ -1,6 +1,7 @@
 """Replay: bit for bit from the raw bytes, for every law on every machine, and it notices what was changed."""
 
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -105,6 +106,23 @@ def test_a_run_without_bytes_is_refused(tmp_path):
 def test_a_run_without_its_snapshot_is_refused(recorded):
     with pytest.raises(RecordError, match="nothing to replay"):
         replay_run(dataclasses.replace(recorded, snapshot=None))
+
+
+@pytest.mark.parametrize("kept_share", [0.0, 0.5])
+def test_a_run_that_lost_rows_is_not_exact(recorded, tmp_path, kept_share):
+    shutil.copytree(recorded.folder, tmp_path / "cut")
+    path = tmp_path / "cut" / "samples.arrow"
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept_share * len(content))])
+    missing = recorded.rows.size - read_run(tmp_path / "cut").rows.size
+    with pytest.raises(RecordError, match=f"{missing} of {recorded.rows.size} rows are missing.*nothing to replay"):
+        replay(tmp_path / "cut")
+
+
+@pytest.mark.parametrize("mappings", [{"macro": None}, {"macro": {}}, {"macro": {"rpdo": 3}}])
+def test_damaged_mappings_are_refused(recorded, mappings):
+    with pytest.raises(RecordError, match="mappings are damaged"):
+        replay_run(dataclasses.replace(recorded, manifest={**recorded.manifest, "mappings": mappings}))
 
 
 def test_a_run_read_twice_replays_alike(recorded):

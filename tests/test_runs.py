@@ -1,8 +1,12 @@
 """Runs as a user meets them: named, listed, shown, taken out to CSV, Parquet and MAT, taken in from CSV and MAT."""
 
 import csv
+import json
+import os
+import stat
 import struct
 from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as parquet
@@ -106,6 +110,87 @@ def test_a_folder_of_runs_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RequestError, match="is a file"):
         list_runs(tmp_path / "file")
+
+
+@pytest.mark.parametrize(("name", "value"), [("record", None), ("end", None), ("end", -1), ("mappings", None)])
+def test_one_damaged_manifest_hides_no_other_run(folder, name, value):
+    with Recorder(folder.parent / "odd", {}):
+        pass
+    path = folder.parent / "odd" / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
+    whole, odd = list_runs(folder.parent)
+    assert (whole.state, odd.state) == ("closed", "damaged")
+    assert f"{name} is {json.dumps(value)}" in odd.note
+    with pytest.raises(RecordError, match="the file is damaged"):
+        show(folder.parent / "odd")
+
+
+@pytest.mark.parametrize("kept", ["half", "none", "no file"])
+def test_rows_that_the_file_lost_are_said(tmp_path, kept):
+    rows = new_rows(900)
+    rows["t_ns"] = np.arange(900) * 1_000_000
+    with Recorder(tmp_path / "run", {}) as recorder:
+        recorder.append(rows)
+    path = tmp_path / "run" / "samples.arrow"
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2 if kept == "half" else 0])
+    if kept == "no file":
+        path.unlink()
+    (listed,) = list_runs(tmp_path)
+    described = show(tmp_path / "run")
+    assert (described["rows_count"] > 0) == (kept == "half")
+    said = f"{900 - described['rows_count']} of 900 rows are missing"
+    assert listed.state == described["state"] == "damaged"
+    assert listed.rows_count == described["rows_count"] == 900 - described["rows_missing_count"]
+    assert said in listed.note
+    assert said in described["note"]
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "folder", "empty", "root"])
+def test_an_export_replaces_files_only(folder, tmp_path, kind):
+    os.mkfifo(tmp_path / "pipe")
+    os.mknod(tmp_path / "device", stat.S_IFCHR | 0o600, os.makedev(1, 7)) if os.getuid() == 0 else None
+    device = tmp_path / "device" if os.getuid() == 0 else Path("/dev/full")
+    out = {"device": device, "pipe": tmp_path / "pipe", "folder": tmp_path, "empty": Path(""), "root": Path("/")}[kind]
+    before = out.stat().st_mode
+    with pytest.raises(RequestError, match="give the path of a file"):
+        export(folder, "csv", ["t_ns"], out)
+    assert out.stat().st_mode == before
+    assert not list(out.absolute().parent.glob(".*.part"))
+
+
+def test_an_export_replaces_a_file(folder, tmp_path):
+    (tmp_path / "old.csv").write_text("old")
+    assert export(folder, "csv", ["t_ns"], tmp_path / "old.csv").read_text().startswith("t_ns\n")
+
+
+@pytest.mark.parametrize("format", ["csv", "parquet", "mat"])
+def test_a_run_in_a_folder_whose_name_is_no_utf_8_is_listed_and_exported(folder, format):
+    odd = folder.rename(os.fsdecode(os.fsencode(folder.parent) + b"/caf\xe9"))
+    assert [one.state for one in list_runs(odd.parent)] == ["closed"]
+    assert export(odd, format).stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("t,µ\n0,1\n1,2\n".encode("latin-1"), r"byte 0xB5 in the header.*save as UTF-8"),
+        ("t,x\n0,1\n1,2\n".encode("utf-16"), "looks like UTF-16.*save as UTF-8"),
+        ("t,x\n0,1\n1,2\n".encode("utf-16-le"), "looks like UTF-16.*save as UTF-8"),
+    ],
+    ids=["latin-1", "utf-16", "utf-16-le"],
+)
+def test_import_names_an_encoding_that_it_does_not_read(tmp_path, content, said):
+    (tmp_path / "t.csv").write_bytes(content)
+    with pytest.raises(RecordError, match=said):
+        import_table(tmp_path / "t.csv", ["t_ns=t:s"], tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_import_reads_tables_whose_name_is_no_utf_8(tmp_path):
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.csv"))
+    path.write_text("t,µ\n0,1\n1,2\n", encoding="utf-8-sig")
+    assert import_table(path, ["t_ns=t:s", "end_position_m=µ:m"], tmp_path / "run").rows_count == 2
 
 
 def test_a_profile_of_another_version_is_said(folder):

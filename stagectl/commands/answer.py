@@ -1,5 +1,6 @@
 """How a command speaks: one answer on stdout, progress and errors on stderr, an exit code that means something."""
 
+import codecs
 import json
 import math
 import sys
@@ -74,6 +75,7 @@ def deliver(command: str, as_json: bool, work: Callable[[Voice], Answer]) -> NoR
     console = Console(stderr=True)
     interruption = Interruption()
     voice = Voice(console, LiveProgress(console, interruption.check), interruption.hush)
+    _say_where_compiled_code_goes(voice)
     try:
         with interruption, voice.progress:
             answer = work(voice)
@@ -93,9 +95,39 @@ def deliver(command: str, as_json: bool, work: Callable[[Voice], Answer]) -> NoR
     raise typer.Exit(answer.exit_code)
 
 
+def _say_where_compiled_code_goes(voice: Voice) -> None:
+    from stagectl.compiled import CACHE_REMARK  # numba: not for a command line that is wrong
+
+    if CACHE_REMARK:
+        voice.warn(CACHE_REMARK)
+
+
 def _print_json(value: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(jsonable(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    content = jsonable(value)
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    if codecs.lookup(sys.stdout.encoding or "ascii").name != "utf-8" or _has_raw_bytes(text):
+        text = json.dumps(content, indent=2, allow_nan=False)
+    sys.stdout.write(text + "\n")
     sys.stdout.flush()
+
+
+def _has_raw_bytes(text: str) -> bool:
+    """Tell whether bytes of a path that are no UTF-8 stand in a text, as lone surrogates."""
+    return any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
+def _ending(run: Path | None) -> dict[str, str]:
+    """Return the name of the Stop that a run was closed with; empty where there is none."""
+    if run is None:
+        return {}
+    from stagectl.record import read_manifest
+    from stagectl.runs import ending
+
+    try:
+        stop, _ = ending(read_manifest(run))
+    except RecordError:  # the error that is said already stands first
+        return {}
+    return {"stop": stop} if stop else {}
 
 
 def _say_error(
@@ -109,7 +141,7 @@ def _say_error(
         voice.note(f"the run up to here: {run}")
     if as_json:
         failure = {"kind": kind, "message": str(error)}
-        _print_json({"command": command, "exit_code": exit_code, "error": failure, "run": run})
+        _print_json({"command": command, "exit_code": exit_code, "error": failure, "run": run, **_ending(run)})
 
 
 def _say_interrupted(command: str, as_json: bool, console: Console, voice: Voice) -> None:

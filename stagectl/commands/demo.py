@@ -35,14 +35,17 @@ def show(voice: Voice, profile: str, backend: str, runs_root: Path, seed: int) -
     voice.progress.done()
     shown: list = [terminal(table) for table in tables(scores)]
     finished = driven.stop is Stop.FINISHED
+    text = f"{driven.outcomes[-1].name}: {driven.outcomes[-1].text}"
     shown += [f"[yellow]repeated once:[/] {trip.text}" for trip in driven.trips]
     if not finished:
-        shown.append(f"[red]the demo ended early:[/] {driven.outcomes[-1].name}: {driven.outcomes[-1].text}")
+        shown.append(f"[red]the demo ended early:[/] {text}")
     shown += [f"run     {folder}", f"report  {report}", f"[dim]next: stagectl replay {folder}[/]"]
     data = {
         "run": folder,
         "report": report,
         "stop": driven.stop.name,
+        "finished": finished,
+        "text": text,
         "repeated": [{"motion": trip.motion, "stop": trip.stop.name, "text": trip.text} for trip in driven.trips],
         **scores_json(scores),
     }

@@ -1,5 +1,6 @@
-"""Ctrl-C and SIGTERM: heard at the next point where nothing is half done, and only once."""
+"""Ctrl-C, SIGTERM and a closed terminal: heard at the next point where nothing is half done, and only once."""
 
+import os
 import signal
 from types import FrameType
 
@@ -7,7 +8,7 @@ _PATIENCE_S = 1.0
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C or SIGTERM, heard.
+    """Ctrl-C, SIGTERM or SIGHUP, heard.
 
     Not KeyboardInterrupt itself: where that passes through an import in C, CPython ends the process by SIGINT at last,
     whatever exit code it was given (unhandled_keyboard_interrupt in its runtime).
@@ -19,6 +20,7 @@ class Interruption:
 
     Where nobody calls `check` for a second (a drive that answers slowly), the interrupt is raised right there.
     After `hush` nothing interrupts any more: coming to rest and closing the run go on undisturbed.
+    A terminal that is gone (SIGHUP) takes no word: what would be said there goes nowhere, instead of failing.
     """
 
     def __init__(self) -> None:
@@ -26,9 +28,13 @@ class Interruption:
         self._asked = False
         self._raised = False
         self._before: dict[int, object] = {}
+        self._terminals: list[int] = []
 
     def __enter__(self) -> "Interruption":
-        for number in (signal.SIGINT, signal.SIGTERM):
+        self._terminals = [fileno for fileno in (0, 1, 2) if os.isatty(fileno)]
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue  # nohup: the command shall outlive its terminal
             self._before[number] = signal.signal(number, self._hear)
         self._before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._lose_patience)
         return self
@@ -51,10 +57,20 @@ class Interruption:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGHUP:
+            self._leave_terminal()
         if not self._asked:
             self._asked = True
         if not self._raised:
             signal.setitimer(signal.ITIMER_REAL, _PATIENCE_S)
+
+    def _leave_terminal(self) -> None:
+        """Point what was the terminal to nowhere; one that still answers (`kill -HUP`) stays."""
+        for fileno in self._terminals:
+            if not os.isatty(fileno):
+                nowhere = os.open(os.devnull, os.O_RDWR)
+                os.dup2(nowhere, fileno)
+                os.close(nowhere)
 
     def _lose_patience(self, number: int, frame: FrameType | None) -> None:
         self.check()

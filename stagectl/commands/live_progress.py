@@ -1,5 +1,6 @@
 """Progress on stderr: a bar for the step under way, a line for each step that is done."""
 
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -42,6 +43,10 @@ class LiveProgress:
     def __call__(self, what: str, share: float) -> None:
         """Report that `what` is under way; share 0 where nobody knows how far."""
         self._check()
+        with contextlib.suppress(OSError):  # a terminal that is just being closed must not end what moves
+            self._show(what, share)
+
+    def _show(self, what: str, share: float) -> None:
         if what != self._what:
             self.done()
             self._what, self._began_s = what, time.monotonic()

@@ -5,16 +5,17 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
+from stagectl.commands.answer import ENDED_EARLY, EXIT_CODES, Answer, Voice
 from stagectl.commands.opening import Place, home_and_arm, law_name, opened, place
 from stagectl.commands.planning import Shape, kind_of, planned, target
 from stagectl.commands.scores_json import scores_json
 from stagectl.commands.tables import terminal
-from stagectl.errors import RequestError
+from stagectl.errors import LinkError, RequestError
 from stagectl.record import read_run
+from stagectl.run_folder import reserved
 from stagectl.run_page import scores_of, tables
 from stagectl.run_scores import read_truth
-from stagectl.runs import new_run_folder
+from stagectl.signals import Stop
 from stagectl.supervisor import Outcome, Supervisor
 
 
@@ -129,9 +130,9 @@ class _ValueSeam:
 
 def _behind_value_seam(where: Place, voice: Voice, name: str, motion: Callable[[_ValueSeam], Outcome]) -> Answer:
     """Simulate, record and score."""
-    folder = new_run_folder(where.runs_root, name)
-    voice.run_folder = folder
-    return _answer(voice, folder, motion(_ValueSeam(where, folder, voice)), {})
+    with reserved(where.runs_root, name) as folder:
+        voice.run_folder = folder
+        return _answer(voice, folder, motion(_ValueSeam(where, folder, voice)), {})
 
 
 def _answer(voice: Voice, folder: Path, outcome: Outcome, facts: dict) -> Answer:
@@ -146,4 +147,5 @@ def _answer(voice: Voice, folder: Path, outcome: Outcome, facts: dict) -> Answer
     shown.append(escape(text) if outcome.finished else f"[red]ended early[/]: {escape(text)}")
     shown += [f"run     {escape(str(folder))}", f"[dim]figures: stagectl runs plot {escape(str(folder))}[/]"]
     facts = {"stop": outcome.stop.name, "finished": outcome.finished, "text": text, **facts}
-    return Answer({"run": folder, **facts, **scores_json(scores)}, shown, 0 if outcome.finished else ENDED_EARLY)
+    ended_early = EXIT_CODES[LinkError] if outcome.stop is Stop.LINK_LOST else ENDED_EARLY
+    return Answer({"run": folder, **facts, **scores_json(scores)}, shown, 0 if outcome.finished else ended_early)

@@ -9,6 +9,7 @@ from pathlib import Path
 from stagectl.commands.answer import Voice
 from stagectl.errors import RequestError, StagectlError
 from stagectl.profile import Profile, load_profile
+from stagectl.run_folder import give_back
 from stagectl.run_scores import VALUE_SEAM, write_truth
 from stagectl.stage import BACKENDS, open_stage
 from stagectl.suggestion import closest
@@ -68,20 +69,23 @@ def opened(where: Place, name: str, voice: Voice) -> Iterator[Supervisor]:
         seed=where.seed,
         progress=voice.progress,
     )
-    voice.note(f"{where.profile.name} on {stage.backend.description}")
-    if where.backend == "auto" and stage.backend.name != "hardware":
-        voice.note("auto: neither the profile's CAN interface nor its serial port is here, so the rig plays it")
     voice.run_folder = stage.folder
-    with stage:
-        try:
-            yield stage
-        except BaseException:
+    try:
+        voice.note(f"{where.profile.name} on {stage.backend.description}")
+        if where.backend == "auto" and stage.backend.name != "hardware":
+            voice.note("auto: neither the profile's CAN interface nor its serial port is here, so the rig plays it")
+        with stage:
+            try:
+                yield stage
+            except BaseException:
+                voice.hush()
+                with suppress(StagectlError):  # what is under way already says more than what follows from it
+                    _keep_truth(stage)
+                raise
             voice.hush()
-            with suppress(StagectlError):  # what is under way already says more than what follows from it
-                _keep_truth(stage)
-            raise
-        voice.hush()
-        _keep_truth(stage)
+            _keep_truth(stage)
+    finally:
+        give_back(stage.folder)
 
 
 def _keep_truth(stage: Supervisor) -> None:

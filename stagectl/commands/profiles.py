@@ -2,9 +2,12 @@
 
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 from rich.tree import Tree
 
+from drivers.arming import needed_objects
+from drivers.canopen_master import eds_problem
 from stagectl.commands.answer import Answer, Voice
 from stagectl.errors import ProfileError
 from stagectl.profile import Profile, list_profiles, load_profile
@@ -12,8 +15,10 @@ from stagectl.units import unit_of
 
 
 def check(voice: Voice, profile: str) -> Answer:
-    """Load a profile; ProfileError says everything that is wrong with it."""
+    """Load a profile and its EDS files; ProfileError says everything that is wrong with it."""
     found = load_profile(profile)
+    _check_eds(found)
+    remarks = _repeated_effects(found)
     load_ratio = found.worst_bus_load_ratio
     shown = [
         f"[green]✓[/] {found.name}: every key known, every number within its limits",
@@ -28,6 +33,7 @@ def check(voice: Voice, profile: str) -> Answer:
             f"  [yellow]without a sensor[/] the macro brakes at {braking:g} m/s^2, and a limp micro keeps off its "
             f"stops up to {limp:.2g} m/s^2 only: its stops must bear it",
         )
+    shown += [f"  [yellow]{escape(remark)}[/]" for remark in remarks]
     data = {
         "profile": found.name,
         "path": found.source_path,
@@ -35,8 +41,36 @@ def check(voice: Voice, profile: str) -> Answer:
         "axes": list(found.axes),
         "worst_bus_load_ratio": load_ratio,
         "limp_deceleration_m_per_s2": limp,
+        "remarks": remarks,
     }
     return Answer(data, shown)
+
+
+def _check_eds(profile: Profile) -> None:
+    """Refuse EDS files that arming could not use. Errors: ProfileError."""
+    problems: list[str] = []
+    for name in profile.axes:
+        axis, is_macro = profile.axis(name), name == "macro"
+        objects = needed_objects(profile.macro.mode if is_macro else "torque", homes=is_macro)
+        identity = (axis.identity.vendor_id, axis.identity.product_code)
+        problem = eds_problem(profile.eds_path(name), axis.node_id, identity, objects)
+        if problem:
+            problems.append(f'{profile.source_path}: {name}.eds = "{axis.eds}": {problem}')
+    if problems:
+        raise ProfileError("\n".join(problems))
+
+
+def _repeated_effects(profile: Profile) -> list[str]:
+    """Name the effects that stand twice at one place; both act there, and one of them may be a slip of the pen."""
+    first: dict[tuple[str, str], int] = {}
+    remarks: list[str] = []
+    for number, table in enumerate(profile.effects):
+        key = (table["name"], table["acts_on"])
+        earlier = first.setdefault(key, number)
+        if earlier != number:
+            again = f"effects[{number}] is {key[0]} on {key[1]}, as effects[{earlier}] is"
+            remarks.append(f"{again}: both act; remove one if one is meant")
+    return remarks
 
 
 def show(voice: Voice, profile: str) -> Answer:

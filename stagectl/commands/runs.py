@@ -10,6 +10,7 @@ from stagectl import runs
 from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
 from stagectl.errors import RecordError, RequestError
 from stagectl.record import MANIFEST, read_run, recover_orphans
+from stagectl.run_folder import reserved
 from stagectl.signals import Stop, stop_sentence
 from stagectl.suggestion import closest
 
@@ -78,6 +79,7 @@ def show(voice: Voice, run: str, runs_root: Path) -> Answer:
         ("folder", found["folder"]),
         ("state", found["state"]),
         ("ended", found["text"]),
+        *((("missing", found["note"]),) if found["note"] else ()),
         ("profile", found["profile"]),
         ("world", found["manifest"].get("backend_description", "")),
         ("rows", str(found["rows_count"])),
@@ -123,8 +125,8 @@ def bring_in(voice: Voice, table: Path, runs_root: Path, columns: list[str], col
     if bool(columns) == (column_map is not None):
         raise RequestError("say what the columns are: --map FILE.toml, or --column t_ns=time:s once for each; not both")
     name = "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in table.stem).lstrip("._-")
-    folder = runs.new_run_folder(runs_root, name or "table")
-    made = runs.import_table(table, column_map if column_map is not None else columns, folder)
+    with reserved(runs_root, name or "table") as folder:
+        made = runs.import_table(table, column_map if column_map is not None else columns, folder)
     shown = [*made.conversions, *(f"[yellow]{remark}[/]" for remark in made.remarks)]
     shown.append(f"{made.rows_count} rows in {made.folder}")
     return Answer(asdict(made), shown)
