@@ -1,0 +1,203 @@
+"""Everything that could be missing: effects at grids of their shape parameters, errors of known parameters, curves.
+
+Each is a group of whitened columns whose amplitudes are solved for; shapes (a pitch, a Stribeck speed) are searched.
+Pure.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from stagectl.effects import CATALOGUE, Effect
+from stagectl.gap import balance
+from stagectl.gap.balance import Forces, Recording
+
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One hypothesis: the columns of one effect with its shape fixed."""
+
+    name: str
+    acts_on: str
+    shape: dict[str, float]
+    amplitudes: tuple[str, ...]
+    forces: Callable[[Recording], list[Forces]]
+    per_session: bool = False
+    bounds: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """What it is called and where it acts."""
+        return self.name, self.acts_on
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        shape = ", ".join(f"{name} = {value:.4g}" for name, value in self.shape.items())
+        return f"{self.name} on {self.acts_on}" + (f" ({shape})" if shape else "")
+
+
+def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
+    """Errors of what is believed, as terms with the standard deviation of their amplitude (a ratio, or metres)."""
+    believed = recording.believed
+    joint = believed.joint
+    found: list[tuple[Term, float]] = []
+
+    def known(name: str, sd: float, forces: Callable[[Recording], Forces]) -> None:
+        found.append((Term(name, "parameter", {}, ("error_ratio",), lambda r: [forces(r)]), sd))
+
+    def inertia(axis: str) -> Callable[[Recording], Forces]:
+        def of(r: Recording) -> Forces:
+            force_n = -r.mass_kg(axis) * r.motion(axis).acceleration_m_per_s2
+            return Forces(macro_n=force_n) if axis == "macro" else Forces(end_n=force_n)
+
+        return of
+
+    known("macro_mass_kg", believed.macro.mass_sd_kg / believed.macro.mass_kg, inertia("macro"))
+    known("macro_force_constant", believed.macro.force_constant_sd_ratio, lambda r: Forces(macro_n=r.macro_command_n))
+    if believed.micro is not None and recording.end is not None:
+        known("micro_mass_kg", believed.micro.mass_sd_kg / believed.micro.mass_kg, inertia("end"))
+        reaction = sum(row["fraction_ratio"] for row in believed.effects if row["name"] == "micro_reaction")
+
+        def micro_motor(r: Recording) -> Forces:
+            force_n = r.micro_command_n
+            return Forces(macro_n=None if force_n is None or not reaction else -reaction * force_n, end_n=force_n)
+
+        known("micro_force_constant", believed.micro.force_constant_sd_ratio, micro_motor)
+    if joint is not None and recording.end is not None:
+        known("spring_n_per_m", joint.stiffness_sd_ratio, _joint(lambda r: -joint.spring_n_per_m * _relative_m(r)))
+        known("damping_n_s_per_m", joint.damping_sd_ratio, _joint(lambda r: -joint.damping_n_s_per_m * _rate(r)))
+        for side, sign in (("left", -1.0), ("right", 1.0)):
+            stiffness = getattr(joint, f"{side}_stiffness_n_per_m")
+
+            def push(r: Recording, sign: float = sign, stiffness: float = stiffness) -> np.ndarray:
+                return np.where(r.side == sign, sign * stiffness * r.penetration_m, 0.0)
+
+            def edge(r: Recording, sign: float = sign, stiffness: float = stiffness) -> np.ndarray:
+                return np.where(r.side == sign, -sign * stiffness, 0.0)
+
+            known(f"{side}_stiffness_n_per_m", joint.stiffness_sd_ratio, _joint(push))
+            found.append(
+                (Term(f"{side}_m", "parameter", {}, ("error_m",), _as_list(_joint(edge))), joint.width_sd_m)
+            )
+    for row in believed.effects:
+        effect = CATALOGUE[row["name"]]
+        values = [row[name] for name in effect.parameters]
+
+        def existing(r: Recording, effect: Effect = effect, place: str = row["acts_on"], values: list = values) -> Forces:
+            return balance.effect_forces(r, effect, place, values)
+
+        known(f"{row['name']} on {row['acts_on']}", believed.effect_sd_ratio, existing)
+    return found
+
+
+def _as_list(forces: Callable[[Recording], Forces]) -> Callable[[Recording], list[Forces]]:
+    return lambda r: [forces(r)]
+
+
+def _joint(force_on_end: Callable[[Recording], np.ndarray]) -> Callable[[Recording], Forces]:
+    def of(r: Recording) -> Forces:
+        force_n = force_on_end(r)
+        return Forces(macro_n=-force_n, end_n=force_n)
+
+    return of
+
+
+def _relative_m(r: Recording) -> np.ndarray:
+    if r.end is None:
+        raise KeyError("end")
+    return r.end.position_m - r.macro.position_m
+
+
+def _rate(r: Recording) -> np.ndarray:
+    if r.end is None:
+        raise KeyError("end")
+    return r.end.velocity_m_per_s - r.macro.velocity_m_per_s
+
+
+def effect_terms(recordings: list[Recording], grids: dict[str, list[dict[str, float]]]) -> Iterator[Term]:
+    """Yield every effect of the catalogue at every place and shape of its grid."""
+    has_micro = all(r.end is not None for r in recordings)
+    present = {(row["name"], row["acts_on"]) for row in recordings[0].believed.effects}
+    for effect in CATALOGUE.values():
+        if "pitch_m" in effect.parameters or "frequency_hz" in effect.parameters:
+            continue  # searched by what stands out: `periodic_terms`
+        for place in effect.places:
+            if not has_micro and (not place.startswith("macro") or _needs_micro(effect)):
+                continue
+            if (effect.name, place) in present:
+                continue
+            for shape in grids.get(effect.name, [{}]):
+                yield term_of(effect, place, shape)
+
+
+def periodic_terms(
+    recordings: list[Recording], axis: str, pitches_m: list[float], frequencies_hz: list[float]
+) -> Iterator[Term]:
+    """Yield the effects that have a pitch or a frequency, at those that stand out."""
+    force = "macro_force" if axis == "macro" else "micro_force"
+    for effect in CATALOGUE.values():
+        for place in effect.places:
+            if not place.startswith(force.removesuffix("_force")):
+                continue
+            if "pitch_m" in effect.parameters:
+                yield from (term_of(effect, place, {"pitch_m": pitch}) for pitch in pitches_m)
+            elif "frequency_hz" in effect.parameters:
+                yield from (term_of(effect, place, {"frequency_hz": f}) for f in frequencies_hz)
+
+
+def _needs_micro(effect: Effect) -> bool:
+    return any(name.startswith(("micro_", "relative_", "penetration", "contact_")) for name in effect.quantities)
+
+
+def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
+    """Make the term of one effect: linear parameters become columns, a phase a pair of them."""
+    linear = [name for name in effect.linear if name not in shape]
+    with_phase = "phase_rad" in effect.parameters and "phase_rad" not in shape
+    settings: list[dict[str, float]] = []
+    for name in linear:
+        for phase in (0.0, 0.5 * np.pi) if with_phase else (None,):
+            values = dict.fromkeys(linear, 0.0) | {name: 1.0} | shape
+            if phase is not None:
+                values["phase_rad"] = phase
+            settings.append(values)
+    amplitudes = tuple(f"{name}*" if with_phase else name for name in linear for _ in range(2 if with_phase else 1))
+
+    def forces(r: Recording) -> list[Forces]:
+        return [
+            balance.effect_forces(r, effect, place, [values[name] for name in effect.parameters])
+            for values in settings
+        ]
+
+    per_session = any(tag == "session" for tag in effect.tags.values())
+    bounds = () if with_phase else tuple(effect.bounds[name] for name in linear)
+    return Term(effect.name, place, dict(shape), amplitudes, forces, per_session, bounds)
+
+
+_KNOTS_COUNT = 12
+_CURVES = ("position_m", "velocity_m_per_s", "acceleration_m_per_s2", "t_s")
+
+
+def curve_terms(recordings: list[Recording]) -> Iterator[Term]:
+    """Yield tables over one quantity of each body: what stands for an effect that no library has."""
+    axes = recordings[0].axes
+    for axis in axes:
+        for quantity in (*_CURVES, *(("relative_position_m",) if len(axes) > 1 else ())):
+            spans = [balance.quantities(r, axis)[quantity] for r in recordings]
+            low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
+            if not high > low:
+                continue
+            knots = np.linspace(low, high, _KNOTS_COUNT)
+
+            def forces(r: Recording, axis: str = axis, quantity: str = quantity, knots: np.ndarray = knots) -> list[Forces]:
+                value = balance.quantities(r, axis)[quantity]
+                hats = [np.interp(value, knots, np.eye(_KNOTS_COUNT)[k]) for k in range(_KNOTS_COUNT)]
+                return [Forces(macro_n=hat) if axis == "macro" else Forces(end_n=hat) for hat in hats]
+
+            place = "macro_force" if axis == "macro" else "micro_force"
+            names = tuple(f"{knot:.6g}" for knot in knots)
+            yield Term(f"curve over {quantity}", place, {}, names, forces)
+
+

@@ -1,0 +1,249 @@
+"""Which hypotheses stay: generalised least squares on whitened columns, thresholds from the workflow's own null.
+
+Everything is algebra on one Gram matrix a recording, so hundreds of hypotheses and hundreds of nulls cost seconds. A
+term stays when it gains on the recordings it was fitted on AND on recordings that no fit saw, each beyond what the
+best of the whole library gains on noise, and when it explains a share of what is reducible at all. Pure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+NULL_QUANTILE = 0.99
+MATERIAL_RATIO = 0.03
+"""Share of the reducible part (beyond the floor) that a term must explain, on either side."""
+
+ALIAS_GAIN = 9.0
+"""Log-likelihood ratio (twice) below which two names can't be told apart: power 0.9 needs about this."""
+
+_ALIAS_SHARE = 0.03
+_JITTER = 1e-10
+_BOUND_SDS = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Sums:
+    """One recording: Gram matrix of [innovations, columns...] in units of the noise, and how many numbers it sums."""
+
+    gram: np.ndarray
+    count: float
+    session: str
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Columns that stay or go together; `prior_sd` > 0 where their amplitude is known so well."""
+
+    key: object
+    columns: tuple[int, ...]
+    per_session: bool = False
+    prior_sd: float = 0.0
+    bounds: tuple[tuple[float, float], ...] = ()  # of each amplitude; a friction that drives is no friction
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Amplitudes of some groups on some recordings, and what they gain over none at all."""
+
+    groups: tuple[Group, ...]
+    slots: tuple[tuple[int, str], ...]  # (column, session or "")
+    values: np.ndarray
+    covariance: np.ndarray
+    gain: float
+
+    def of(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
+        """Return values and standard deviations of one group, sessions one after the other."""
+        places = [k for k, (column, _) in enumerate(self.slots) if column in group.columns]
+        return self.values[places], np.sqrt(np.maximum(np.diag(self.covariance)[places], 0.0))
+
+
+def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
+    """Solve the amplitudes of `groups` on all of `sums`."""
+    sessions = sorted({s.session for s in sums})
+    slots: list[tuple[int, str]] = []
+    precision: list[float] = []
+    for group in groups:
+        for session in sessions if group.per_session else ("",):
+            for column in group.columns:
+                slots.append((column, session))
+                precision.append(group.prior_sd**-2 if group.prior_sd > 0.0 else 0.0)
+    size = len(slots)
+    normal = np.diag(np.array(precision)) if size else np.zeros((0, 0))
+    right = np.zeros(size)
+    for s in sums:
+        here = [k for k, (_, session) in enumerate(slots) if session in ("", s.session)]
+        columns = [slots[k][0] for k in here]
+        normal[np.ix_(here, here)] += s.gram[np.ix_(columns, columns)]
+        right[here] += s.gram[columns, 0]
+    if not size:
+        return Solution(tuple(groups), (), np.zeros(0), np.zeros((0, 0)), 0.0)
+    scale = np.sqrt(np.diag(normal))
+    scale[scale == 0.0] = 1.0  # a column that nothing excites
+    scaled = normal / np.outer(scale, scale) + _JITTER * np.eye(size)
+    inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
+    values = inverse @ right
+    return Solution(tuple(groups), tuple(slots), values, inverse, float(right @ values))
+
+
+def within_bounds(solution: Solution) -> bool:
+    """Tell whether no amplitude is outside what its effect can be, by more than twice its standard deviation."""
+    allowed = {column: bounds for group in solution.groups for column, bounds in zip(group.columns, group.bounds)}
+    for (column, _), value, variance in zip(solution.slots, solution.values, np.diag(solution.covariance), strict=True):
+        if column in allowed:
+            low, high = allowed[column]
+            slack = _BOUND_SDS * float(np.sqrt(max(variance, 0.0)))
+            if not low - slack <= value <= high + slack:
+                return False
+    return True
+
+
+def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
+    """Return by how much amplitudes from elsewhere lower the squares of recordings that no fit saw.
+
+    Amplitudes that belong to a session are solved there, and cost what so many free amplitudes gain on noise.
+    """
+    fixed = [k for k, (_, session) in enumerate(solution.slots) if session == ""]
+    own = sorted({column for column, session in solution.slots if session != ""})
+    total = 0.0
+    columns = [solution.slots[k][0] for k in fixed]
+    theta = solution.values[fixed]
+    for s in held:
+        total += float(2.0 * theta @ s.gram[columns, 0] - theta @ s.gram[np.ix_(columns, columns)] @ theta)
+        if own:
+            right = s.gram[own, 0] - s.gram[np.ix_(own, columns)] @ theta
+            normal = s.gram[np.ix_(own, own)]
+            normal = normal + _JITTER * np.trace(normal) * np.eye(len(own))
+            total += float(right @ np.linalg.solve(normal, right)) - len(own)
+    return total
+
+
+@dataclass(slots=True)
+class Judge:
+    """Training recordings, recordings that no fit sees, and the library that competes."""
+
+    training: list[Sums]
+    held: list[Sums]
+    base: list[Group]
+    library: list[Group]
+    thresholds: tuple[float, float] = (0.0, 0.0)
+    trace: list[str] = field(default_factory=list)
+
+    def gains(self, groups: Sequence[Group], sums: tuple[list[Sums], list[Sums]] | None = None) -> tuple[float, float]:
+        """Return (gain on training, gain on held-out recordings) of base and `groups`.
+
+        Without recordings kept apart, each training recording is held out once.
+        """
+        training, held = (self.training, self.held) if sums is None else sums
+        whole = solve([*self.base, *groups], training)
+        if held:
+            return whole.gain, held_out_gain(whole, held)
+        if len(training) == 1:
+            return whole.gain, whole.gain
+        apart = 0.0
+        for k in range(len(training)):
+            others = training[:k] + training[k + 1 :]
+            apart += held_out_gain(solve([*self.base, *groups], others), [training[k]])
+        return whole.gain, apart
+
+    def calibrate(self, draws_count: int, seed: int) -> None:
+        """Set thresholds: the quantile of the best gains of the whole library on noise, 200 draws and more."""
+        random = np.random.default_rng(seed)
+        best = np.zeros((draws_count, 2))
+        roots = {id(s): _root(s.gram[1:, 1:]) for s in [*self.training, *self.held]}
+        for k in range(draws_count):
+            noise = [[_with_noise(s, roots[id(s)], random) for s in part] for part in (self.training, self.held)]
+            sums = (noise[0], noise[1])
+            none = self.gains([], sums)
+            gains = [self.gains([group], sums) for group in self.library]
+            best[k] = max(g[0] - none[0] for g in gains), max(g[1] - none[1] for g in gains)
+        self.thresholds = (float(np.quantile(best[:, 0], NULL_QUANTILE)), float(np.quantile(best[:, 1], NULL_QUANTILE)))
+
+    def reducible(self, groups: Sequence[Group]) -> tuple[float, float]:
+        """Return what is left above the floor on training and held-out recordings, in squares of the noise."""
+        gain = self.gains(groups)
+        held = self.held or self.training
+        left = sum(s.gram[0, 0] - s.count for s in self.training) - gain[0]
+        apart = sum(s.gram[0, 0] - s.count for s in held) - gain[1]
+        return max(left, 0.0), max(apart, 0.0)
+
+    def select(self, most: int = 8) -> list[Group]:
+        """Add the best term as long as one stays, then take back what the others have made superfluous."""
+        chosen: list[Group] = []
+        while len(chosen) < most:
+            now = self.gains(chosen)
+            left = self.reducible(chosen)
+            ranked = []
+            taken = {group.key for group in chosen}
+            for group in self.library:
+                if group.key in taken or not within_bounds(solve([*self.base, *chosen, group], self.training)):
+                    continue
+                gains = self.gains([*chosen, group])
+                ranked.append((gains[0] - now[0], gains[1] - now[1], group))
+            passing = [row for row in ranked if self._stays(row[0], row[1], left)]
+            best = max(passing, key=lambda row: row[0] + row[1] - 2.0 * len(row[2].columns), default=None)
+            top = sorted(ranked, key=lambda row: -(row[0] + row[1]))[:4]
+            self.trace.append(
+                f"left {left[0]:.0f} / {left[1]:.0f}: "
+                + "; ".join(f"{row[2].key} {row[0]:.0f} / {row[1]:.0f}" for row in top)
+            )
+            if best is None:
+                break
+            chosen.append(best[2])
+            chosen = self._without_superfluous(chosen)
+        return chosen
+
+    def _stays(self, trained: float, apart: float, left: tuple[float, float]) -> bool:
+        return (
+            trained > max(self.thresholds[0], MATERIAL_RATIO * left[0])
+            and apart > max(self.thresholds[1], MATERIAL_RATIO * left[1])
+        )
+
+    def _without_superfluous(self, chosen: list[Group]) -> list[Group]:
+        """Take terms back whose loss is below the thresholds now, the least useful first."""
+        while len(chosen) > 1:
+            now = self.gains(chosen)
+            losses = []
+            for group in chosen:
+                rest = [other for other in chosen if other is not group]
+                gains = self.gains(rest)
+                losses.append((now[0] - gains[0], now[1] - gains[1], group))
+            weakest = min(losses, key=lambda row: row[0] + row[1])
+            if self._stays(weakest[0], weakest[1], (0.0, 0.0)):
+                return chosen
+            chosen = [other for other in chosen if other is not weakest[2]]
+        return chosen
+
+    def aliases(self, chosen: Sequence[Group], group: Group) -> list[tuple[object, float]]:
+        """Return the keys that would do as well as `group` beside the others, with the margin that they lose by."""
+        everything = [*self.training, *self.held]
+        rest = [other for other in chosen if other is not group]
+        with_it = solve([*self.base, *chosen], everything).gain
+        without = solve([*self.base, *rest], everything).gain
+        limit = max(ALIAS_GAIN, _ALIAS_SHARE * (with_it - without))
+        margins: dict[object, float] = {}
+        taken = {other.key for other in chosen}
+        for other in self.library:
+            if other.key in taken:
+                continue
+            instead = solve([*self.base, *rest, other], everything)
+            if not within_bounds(instead):
+                continue
+            margin = with_it - instead.gain
+            if other.key not in margins or margin < margins[other.key]:
+                margins[other.key] = margin
+        return sorted(((key, margin) for key, margin in margins.items() if margin < limit), key=lambda row: row[1])
+
+
+def _root(gram: np.ndarray) -> np.ndarray:
+    """Return R with R R' = gram, for drawing noise seen through the columns."""
+    values, vectors = np.linalg.eigh(gram)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _with_noise(s: Sums, root: np.ndarray, random: np.random.Generator) -> Sums:
+    gram = s.gram.copy()
+    seen = root @ random.standard_normal(root.shape[1])
+    gram[0, 1:] = gram[1:, 0] = seen
+    gram[0, 0] = s.count
+    return Sums(gram, s.count, s.session)
