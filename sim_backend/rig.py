@@ -83,8 +83,10 @@ class Rig:
         self._effect_parameters = compose.effect_parameters(self._effects)
         module = compose.plant_module(self._effects)
         rig_module = compose.generated_module("rig", _ADVANCE.format(plant_module=module.__name__))
+        self._senses = any(effect["acts_on"] in ("macro_sensor", "end_sensor") for effect in self._effects)
+        self._sense = module.sense
         self._state = plant.init(machine)
-        self._flat = self._state.view(np.float64)  # all fields are eight bytes wide, floats
+        self._flat = self._state.view(np.float64)  # all fields are eight bytes wide, floats; memory stands last
         self._names = {name: k for k, name in enumerate(plant.PLANT_STATE.names or ())}
         state = self.plant_state()
         macro_m, end_m = state["macro_position_m"], state["end_position_m"]
@@ -257,13 +259,19 @@ class Rig:
     # -- sensor -------------------------------------------------------------------------------------------------------
 
     def _take_sample(self, t_ns: int) -> None:
-        state = self._flat.tolist()
+        value = self._flat.item
         macro_m, end_m, macro_m_per_s, end_m_per_s, macro_integral, end_integral, contact_n, macro_n, micro_n = [
-            state[k] for k in self._columns
+            value(k) for k in self._columns
         ]
         interferometer = self.interferometer
         sequence = interferometer.next_sequence
-        taken = interferometer.sample(macro_m, end_m, macro_m_per_s, end_m_per_s)
+        macro_error_m, end_error_m = 0.0, 0.0
+        if self._senses:
+            span_s = 0.0 if self._last_sample is None else 1e-9 * (t_ns - self._last_sample[0])
+            macro_error_m, end_error_m = self._sense(
+                self._state, self._plant_parameters, self._effect_parameters, span_s
+            )
+        taken = interferometer.sample(macro_m + macro_error_m, end_m + end_error_m, macro_m_per_s, end_m_per_s)
         if taken is not None and not self.is_unplugged:
             self._lines.append(taken)
         macro_mean_m, end_mean_m = macro_m, end_m

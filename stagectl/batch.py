@@ -67,6 +67,7 @@ def run(setpoints, noise_m, late, instants_s, devices, state, parameters, machin
     for k in range(setpoints.size):
         t_s, latch_s = instants_s[k, 0], instants_s[k, 1]
         plant_module.advance(state, parameters, machine_effects, t_s, d.longest_substep_s, d.macro_a, d.micro_a, 1, 1)
+        macro_error_m, end_error_m = plant_module.sense(state, parameters, machine_effects, t_s - d.mean_from_s)
         truth[k].t_s = t_s
         truth[k].end_mean_m = s.end_position_m - d.end_origin_m - d.end_zero_m
         if t_s > d.mean_from_s:
@@ -80,8 +81,8 @@ def run(setpoints, noise_m, late, instants_s, devices, state, parameters, machin
         m.cycle = int(d.sample)
         m.t_ns = int(latch_s * 1e9)
         m.lease_left_ns = 1000000000
-        macro_m = s.macro_position_m + noise_m[k, 0] - d.macro_origin_m
-        end_m = s.end_position_m + noise_m[k, 1] - d.end_origin_m
+        macro_m = s.macro_position_m + macro_error_m + noise_m[k, 0] - d.macro_origin_m
+        end_m = s.end_position_m + end_error_m + noise_m[k, 1] - d.end_origin_m
         macro_step_m = d.macro_resolution_m
         if abs(s.macro_velocity_m_per_s) <= d.interpolation_speed_m_per_s:
             macro_step_m /= d.interpolation_count

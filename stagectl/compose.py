@@ -1,15 +1,15 @@
 """Compose a machine or a belief from its effects: a small generated module, cached under a hash.
 
-The module calls the listed effects in a row, by name, with their parameters from one float64 array;
-so its text depends on which effects there are, never on their values (masking 35 slots instead
-costs 46 ns a call).
+The module calls the listed effects in a row, by name, with their parameters from one float64 array and their
+memories from another, which stands in the plant's state; so its text depends on which effects there are, never
+on their values (masking 35 slots instead costs 46 ns a call).
 """
 
 import hashlib
 import importlib.util
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -17,14 +17,34 @@ from typing import Any
 import numpy as np
 
 from stagectl.compiled import CACHE_FOLDER
-from stagectl.effects import CATALOGUE, CONTACT_QUANTITIES, PLACES, QUANTITIES
+from stagectl.effects import CATALOGUE, QUANTITIES_OF, Effect
 from stagectl.errors import ProfileError
+from stagectl.plant import MEMORY_COUNT
 
 _FORCES_HEAD = '''"""Generated: the effects of one machine, called in a row."""
 from stagectl import plant
 from stagectl.compiled import inlined
 from stagectl.effects import CATALOGUE
 '''
+
+_ALONG = '''"""Generated: one effect along rows."""
+import numpy as np
+
+from stagectl.compiled import compiled
+from stagectl.effects import CATALOGUE
+
+law = CATALOGUE[{name!r}].compiled_law
+
+
+@compiled
+def along(columns, parameters, memory):
+    out = np.empty(columns.shape[0])
+    for k in range(out.size):
+        out[k] = law({arguments})
+    return out
+'''
+
+_COMMANDS = ("macro_command", "micro_command")
 
 _SUBSTEP = '''
 
@@ -33,23 +53,52 @@ def substep(state, parameters, effect_parameters, dt_s, macro_command_a, micro_c
     s = state[0]
     q = parameters[0]
     p = effect_parameters
+    memory = s.memory
+    macro_command_a += macro_command(macro_command_a, s.t_s, dt_s, memory, p)
+    micro_command_a += micro_command(micro_command_a, s.t_s, dt_s, memory, p)
+    s.left_edge_shift_m = contact_edge(-1.0, s.t_s, memory, p)
+    s.right_edge_shift_m = contact_edge(1.0, s.t_s, memory, p)
     plant.half_step(s, q, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_bridge)
-    relative_m = s.middle_end_position_m - s.middle_macro_position_m
-    relative_m_per_s = s.middle_end_velocity_m_per_s - s.middle_macro_velocity_m_per_s
+    t_s = s.t_s + 0.5 * dt_s
+    macro_m = s.middle_macro_position_m
+    macro_m_per_s = s.middle_macro_velocity_m_per_s
+    macro_m_per_s2 = s.macro_acceleration_m_per_s2
+    end_m = s.middle_end_position_m
+    end_m_per_s = s.middle_end_velocity_m_per_s
+    end_m_per_s2 = s.end_acceleration_m_per_s2
+    relative_m = end_m - macro_m
+    relative_m_per_s = end_m_per_s - macro_m_per_s
     macro_motor_n = s.macro_force_n
     micro_motor_n = s.micro_force_n
-    micro_motor_n += micro_actuator(s.middle_end_position_m, s.middle_end_velocity_m_per_s, relative_m,
-                                    relative_m_per_s, s.micro_current_a, micro_motor_n, micro_motor_n, s.t_s, p)
-    macro_motor_n += macro_actuator(s.middle_macro_position_m, s.middle_macro_velocity_m_per_s, relative_m,
-                                    relative_m_per_s, s.macro_current_a, macro_motor_n, micro_motor_n, s.t_s, p)
+    micro_motor_n += micro_actuator(end_m, end_m_per_s, end_m_per_s2, q.micro_mass_kg, relative_m, relative_m_per_s,
+                                    s.micro_current_a, micro_motor_n, micro_motor_n, t_s, dt_s, memory, p)
+    macro_motor_n += macro_actuator(macro_m, macro_m_per_s, macro_m_per_s2, q.macro_mass_kg, relative_m,
+                                    relative_m_per_s, s.macro_current_a, macro_motor_n, micro_motor_n, t_s, dt_s,
+                                    memory, p)
     s.macro_force_n = macro_motor_n
     s.micro_force_n = micro_motor_n
-    macro_n = macro_force(s.middle_macro_position_m, s.middle_macro_velocity_m_per_s, relative_m,
-                          relative_m_per_s, s.macro_current_a, macro_motor_n, micro_motor_n, s.t_s, p)
-    micro_n = micro_force(s.middle_end_position_m, s.middle_end_velocity_m_per_s, relative_m,
-                          relative_m_per_s, s.micro_current_a, micro_motor_n, micro_motor_n, s.t_s, p)
-    contact_n = contact(s.penetration_m, s.penetration_velocity_m_per_s, p)
-    plant.full_step(s, q, dt_s, macro_n, micro_n, contact_n)
+    macro_n = macro_force(macro_m, macro_m_per_s, macro_m_per_s2, q.macro_mass_kg, relative_m, relative_m_per_s,
+                          s.macro_current_a, macro_motor_n, micro_motor_n, t_s, dt_s, memory, p)
+    micro_n = micro_force(end_m, end_m_per_s, end_m_per_s2, q.micro_mass_kg, relative_m, relative_m_per_s,
+                          s.micro_current_a, micro_motor_n, micro_motor_n, t_s, dt_s, memory, p)
+    joint_n = joint(relative_m, relative_m_per_s, t_s, dt_s, memory, p)
+    contact_n = contact(s.penetration_m, s.penetration_velocity_m_per_s, plant.contact_stiffness(s, q),
+                        s.contact_side, t_s, dt_s, memory, p)
+    plant.full_step(s, q, dt_s, macro_n - joint_n, micro_n + joint_n, contact_n)
+
+
+@compiled
+def sense(state, parameters, effect_parameters, dt_s):
+    """Return what the sensors add to the macro's and the end's position now, m; `dt_s` since the sample before."""
+    s = state[0]
+    p = effect_parameters
+    macro_m = macro_sensor(s.macro_position_m, s.macro_velocity_m_per_s, s.macro_acceleration_m_per_s2, s.t_s, dt_s,
+                           s.memory, p)
+    if parameters[0].has_micro == 0.0:
+        return macro_m, macro_m
+    end_m = end_sensor(s.end_position_m, s.end_velocity_m_per_s, s.end_acceleration_m_per_s2, s.t_s, dt_s,
+                       s.memory, p)
+    return macro_m, end_m
 
 
 @compiled
@@ -80,6 +129,11 @@ def _check(effects: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
         if set(row) - {"name", "acts_on"} != set(known.parameters):
             raise ProfileError(f"effects[{number}] {name} takes the parameters {known.parameters}, got {sorted(row)}")
         checked.append(row)
+    remembered = sum(CATALOGUE[row["name"]].memory for row in checked)
+    if remembered > MEMORY_COUNT:
+        raise ProfileError(
+            f"effects remember {remembered} numbers, and a machine has room for {MEMORY_COUNT}; remove some"
+        )
     return checked
 
 
@@ -93,17 +147,25 @@ def _forces_source(structure: tuple[tuple[str, str], ...]) -> str:
     """Write one function a place that sums the effects acting there."""
     lines = [_FORCES_HEAD]
     lines += [f"effect_{k} = CATALOGUE[{name!r}].compiled_law" for k, (name, _) in enumerate(structure)]
-    index = 0
-    calls: dict[str, list[str]] = {place: [] for place in PLACES}
+    parameter, remembered = 0, 0
+    calls: dict[str, list[str]] = {place: [] for place in QUANTITIES_OF}
+    at_once: dict[str, list[str]] = {place: [] for place in _COMMANDS}
     for k, (name, place) in enumerate(structure):
         known = CATALOGUE[name]
-        slots = [f"p[{index + j}]" for j in range(len(known.parameters))]
-        index += len(slots)
-        calls[place].append(f"    total += effect_{k}({', '.join([*known.quantities, *slots])})")
-    for place in PLACES:
-        quantities = CONTACT_QUANTITIES if place == "contact" else QUANTITIES
-        lines += ["", "", "@inlined", f"def {place}({', '.join(quantities)}, p):", "    total = 0.0"]
-        lines += [*calls[place], "    return total"]
+        slots = [f"p[{parameter + j}]" for j in range(len(known.parameters))]
+        if known.memory:
+            slots.append(f"memory[{remembered}:{remembered + known.memory}]")
+        parameter += len(known.parameters)
+        remembered += known.memory
+        call = f"    total += effect_{k}({', '.join([*known.quantities, *slots])})"
+        calls[place].append(call)
+        if place in at_once and not known.memory:
+            at_once[place].append(call)
+    calls |= {f"{place}_at_once": lines_of for place, lines_of in at_once.items()}
+    for function, body in calls.items():
+        quantities = QUANTITIES_OF[function.removesuffix("_at_once")]
+        lines += ["", "", "@inlined", f"def {function}({', '.join(quantities)}, memory, p):", "    total = 0.0"]
+        lines += [*body, "    return total"]
     return "\n".join(lines) + "\n"
 
 
@@ -134,8 +196,23 @@ def structure_of(effects: Iterable[Mapping[str, Any]]) -> tuple[tuple[str, str],
 
 @cache
 def forces_module(structure: tuple[tuple[str, str], ...]) -> ModuleType:
-    """Return the module with one compiled function a place (see `stagectl.effects.PLACES`)."""
+    """Return the module with one compiled function a place (see `stagectl.effects.PLACES`).
+
+    `macro_command_at_once` and `micro_command_at_once` leave out what has a memory: the part that a law can undo.
+    """
     return generated_module("forces", _forces_source(structure))
+
+
+@cache
+def along(known: Effect) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """Return a compiled function (columns, parameters, memory) that gives an effect's output row by row.
+
+    columns: float64 (rows, quantities in the order of the declaration); memory is left as the last row leaves it.
+    """
+    arguments = [f"columns[k, {j}]" for j in range(len(known.quantities))]
+    arguments += [f"parameters[{j}]" for j in range(len(known.parameters))]
+    arguments += ["memory"] if known.memory else []
+    return generated_module("along", _ALONG.format(name=known.name, arguments=", ".join(arguments))).along
 
 
 def plant_module(effects: Iterable[Mapping[str, Any]]) -> ModuleType:
@@ -144,6 +221,6 @@ def plant_module(effects: Iterable[Mapping[str, Any]]) -> ModuleType:
     source = (
         '"""Generated: the plant of one machine."""\nimport numpy as np\n\nfrom stagectl import plant\n'
         "from stagectl.compiled import compiled, inlined\n"
-        f"from {forces.__name__} import contact, macro_actuator, macro_force, micro_actuator, micro_force\n" + _SUBSTEP
+        f"from {forces.__name__} import {', '.join(QUANTITIES_OF)}\n" + _SUBSTEP
     )
     return generated_module("plant", source)

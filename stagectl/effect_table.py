@@ -63,7 +63,7 @@ def without_micro(effects: Iterable[Mapping[str, Any]]) -> list[Problem | None]:
     for number, table in enumerate(effects):
         place = table["acts_on"]
         needs = [q for q in CATALOGUE[table["name"]].quantities if q.startswith(("micro_", "relative_"))]
-        if place == "contact" or place.startswith("micro_") or needs:
+        if place in ("contact", "contact_edge", "joint", "end_sensor") or place.startswith("micro_") or needs:
             limit = f"{table['name']} on {place} needs a micro, and there is no [micro] table"
             problems.append(Problem(f"effects[{number}].name", table["name"], limit, "remove it"))
     return problems

@@ -139,20 +139,21 @@ def start(e, s, m):
     s.end_acceleration_m_per_s2 = 0.0
     s.macro_disturbance_n = 0.0
     s.micro_disturbance_n = 0.0
+    s.memory[:] = 0.0
     e.cycle = m.cycle
     e.started = 1.0
 
 
 @compiled
-def correct(e, s, q, m):
+def correct(e, s, q, macro_position_m, end_position_m):
     """Take a fresh sample into the believed machine."""
-    innovation = m.macro_position_m - s.macro_position_m
+    innovation = macro_position_m - s.macro_position_m
     e.macro_innovation_m = innovation
     s.macro_position_m += e.macro_position_gain_ratio * innovation
     s.macro_velocity_m_per_s += e.macro_velocity_gain_per_s * innovation
     s.macro_disturbance_n += e.macro_force_gain_n_per_m * innovation
     if q.has_micro != 0.0:
-        innovation = m.end_position_m - s.end_position_m
+        innovation = end_position_m - s.end_position_m
         e.end_innovation_m = innovation
         s.end_position_m += e.micro_position_gain_ratio * innovation
         s.end_velocity_m_per_s += e.micro_velocity_gain_per_s * innovation

@@ -20,6 +20,9 @@ BRIDGE_OFF = 0
 BRIDGE_CURRENT = 1
 BRIDGE_SHORTED = 2
 
+MEMORY_COUNT = 64
+"""Floats that the effects of one machine may remember, all together."""
+
 _SAME_DT_RATIO = 1e-8  # spans of equal length differ by what rounding of their ends leaves
 _NOISE_SLOT_S = 1e-3  # force noise is held for a millisecond, whatever the substeps, so that both seams feel the same
 
@@ -60,6 +63,9 @@ PLANT_STATE = np.dtype(
         ("penetration_m", "f8"),
         ("penetration_velocity_m_per_s", "f8"),
         ("contact_side", "f8"),  # +1 right (x_b > b_r), -1 left, 0 in the gap
+        ("left_edge_shift_m", "f8"),  # by which effects move an edge of the gap outward
+        ("right_edge_shift_m", "f8"),
+        ("memory", "f8", (MEMORY_COUNT,)),  # of effects, each its slice (`stagectl.compose`); stands last
     ]
 )
 
@@ -278,13 +284,15 @@ def half_step(s, q, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_
     s.micro_force_n = q.micro_force_constant_n_per_a * mean
     x_b = s.middle_macro_position_m - s.middle_end_position_m
     rate = s.middle_macro_velocity_m_per_s - s.middle_end_velocity_m_per_s
-    if x_b > q.right_m:
+    right_m = q.right_m + s.right_edge_shift_m
+    left_m = q.left_m + s.left_edge_shift_m
+    if x_b > right_m:
         s.contact_side = 1.0
-        s.penetration_m = x_b - q.right_m
+        s.penetration_m = x_b - right_m
         s.penetration_velocity_m_per_s = rate
-    elif x_b < -q.left_m:
+    elif x_b < -left_m:
         s.contact_side = -1.0
-        s.penetration_m = -q.left_m - x_b
+        s.penetration_m = -left_m - x_b
         s.penetration_velocity_m_per_s = -rate
     else:
         s.contact_side = 0.0
@@ -303,6 +311,12 @@ def _stop_force(x, v, low, high, stiffness, damping):
 
 
 @inlined
+def contact_stiffness(s, q):
+    """Return the stiffness of the side that touches."""
+    return q.right_stiffness_n_per_m if s.contact_side > 0.0 else q.left_stiffness_n_per_m
+
+
+@inlined
 def joint_force(s, q, contact_effects_n):
     """Return the force of spring, damping, contact and stroke stops on the end at the middle, opposite on the macro."""
     relative_m = s.middle_end_position_m - s.middle_macro_position_m
@@ -318,8 +332,7 @@ def joint_force(s, q, contact_effects_n):
     )
     s.contact_force_n = 0.0
     if s.contact_side != 0.0:
-        stiffness = q.right_stiffness_n_per_m if s.contact_side > 0.0 else q.left_stiffness_n_per_m
-        s.contact_force_n = s.contact_side * max(stiffness * s.penetration_m + contact_effects_n, 0.0)
+        s.contact_force_n = s.contact_side * max(contact_stiffness(s, q) * s.penetration_m + contact_effects_n, 0.0)
     return force_n + s.contact_force_n
 
 

@@ -28,8 +28,11 @@ def estimate(m, e, model, ahead, b, q, p):
     if x.started == 0.0:
         if m.samples_new > 0:
             estimator.start(x, s, m)
-            x.macro_seen_m = m.macro_position_m
-            x.end_seen_m = m.end_position_m
+            macro_error_m, end_error_m = plant_module.sense(model, q, p, 0.0)
+            s.macro_position_m -= macro_error_m
+            s.end_position_m -= end_error_m
+            x.macro_seen_m = s.macro_position_m
+            x.end_seen_m = s.end_position_m
     elif m.cycle > x.cycle:
         if m.command_lost != 0:
             x.macro_word = x.macro_word_before
@@ -49,20 +52,27 @@ def estimate(m, e, model, ahead, b, q, p):
                                  x.macro_word * x.macro_amperes_per_word,
                                  x.micro_word * x.micro_amperes_per_word, 1, 1)
             last = k == periods - 1
+            macro_error_m, end_error_m = plant_module.sense(model, q, p, x.period_s)
             if last and fresh:
-                estimator.correct(x, s, q[0], m)
-            x.macro_seen_m = m.macro_position_m if last and fresh else s.macro_position_m
-            x.end_seen_m = m.end_position_m if last and fresh else s.end_position_m
+                x.macro_seen_m = m.macro_position_m - macro_error_m
+                x.end_seen_m = m.end_position_m - end_error_m
+                estimator.correct(x, s, q[0], x.macro_seen_m, x.end_seen_m)
+            else:
+                x.macro_seen_m = s.macro_position_m
+                x.end_seen_m = s.end_position_m
             if q[0].has_micro != 0.0 and periods + x.predicted_samples <= x.bridged_samples_max:
                 # A line that comes late is one in twenty: its place is filled by what was predicted (a few nm off).
                 mean_n = backlash.motor_mean_force(b[0], q[0], x.micro_word_before, x.micro_word,
                                                    x.micro_amperes_per_word, x.actuation_delay_s)
                 relative_m = x.end_seen_m - x.macro_seen_m
                 rate = s.end_velocity_m_per_s - s.macro_velocity_m_per_s
-                mean_n += forces.micro_actuator(x.end_seen_m, s.end_velocity_m_per_s, relative_m, rate,
-                                                s.micro_current_a, mean_n, mean_n, s.t_s, p)
-                mean_n += forces.micro_force(x.end_seen_m, s.end_velocity_m_per_s, relative_m, rate,
-                                             s.micro_current_a, mean_n, mean_n, s.t_s, p)
+                mean_n += forces.micro_actuator(x.end_seen_m, s.end_velocity_m_per_s, s.end_acceleration_m_per_s2,
+                                                q[0].micro_mass_kg, relative_m, rate, s.micro_current_a, mean_n, mean_n,
+                                                s.t_s, 0.0, s.memory, p)
+                mean_n += forces.micro_force(x.end_seen_m, s.end_velocity_m_per_s, s.end_acceleration_m_per_s2,
+                                             q[0].micro_mass_kg, relative_m, rate, s.micro_current_a, mean_n, mean_n,
+                                             s.t_s, 0.0, s.memory, p)
+                mean_n += forces.joint(relative_m, rate, s.t_s, 0.0, s.memory, p)
                 backlash.step(b[0], x.cycle + k + 1, x.macro_seen_m, x.end_seen_m, mean_n, q[0])
             x.macro_word_before = x.macro_word
             x.micro_word_before = x.micro_word
@@ -80,23 +90,35 @@ def decide(m, now, later, e, ahead, after, l, q, p):
     x = e[0]
     after[0] = ahead[0]
     law.middle(f, later, q[0], l[0], x.period_s)
-    relative_m = f.middle_end_position_m - f.middle_macro_position_m
-    rate = f.middle_end_velocity_m_per_s - f.middle_macro_velocity_m_per_s
+    memory = f.memory  # a copy: what is remembered here is forgotten again
+    dt_s = x.period_s
+    t_s = f.t_s + 0.5 * dt_s
+    macro_m, macro_m_per_s = f.middle_macro_position_m, f.middle_macro_velocity_m_per_s
+    end_m, end_m_per_s = f.middle_end_position_m, f.middle_end_velocity_m_per_s
+    relative_m = end_m - macro_m
+    rate = end_m_per_s - macro_m_per_s
     micro_n = 0.0
     macro_known_n = plant.base_force(f, q[0])
     if q[0].has_micro != 0.0:
-        contact_n = forces.contact(f.penetration_m, f.penetration_velocity_m_per_s, p)
+        contact_n = forces.contact(f.penetration_m, f.penetration_velocity_m_per_s, plant.contact_stiffness(f, q[0]),
+                                   f.contact_side, t_s, dt_s, memory, p)
         joint_n = plant.joint_force(f, q[0], contact_n)
-        known_n = joint_n + forces.micro_force(f.middle_end_position_m, f.middle_end_velocity_m_per_s, relative_m,
-                                               rate, f.micro_current_a, f.micro_force_n, f.micro_force_n, f.t_s, p)
+        joint_n += forces.joint(relative_m, rate, t_s, dt_s, memory, p)
+        known_n = joint_n + forces.micro_force(end_m, end_m_per_s, f.end_acceleration_m_per_s2, q[0].micro_mass_kg,
+                                               relative_m, rate, a.micro_current_a, a.micro_force_n, a.micro_force_n,
+                                               t_s, dt_s, memory, p)
         micro_n = law.precision(l[0], a, f, x, now, later, q[0].micro_mass_kg, known_n, a.micro_disturbance_n,
                                 q[0], x.period_s)
         felt_n = micro_n
-        micro_n -= forces.micro_actuator(f.middle_end_position_m, f.middle_end_velocity_m_per_s, relative_m, rate,
-                                         f.micro_current_a, micro_n, micro_n, f.t_s, p)
+        micro_n -= forces.micro_actuator(end_m, end_m_per_s, f.end_acceleration_m_per_s2, q[0].micro_mass_kg,
+                                         relative_m, rate, a.micro_current_a, micro_n, micro_n, t_s, dt_s, memory, p)
+        k = q[0].micro_force_constant_n_per_a
+        micro_n -= k * forces.micro_command_at_once(micro_n / k, t_s, dt_s, memory, p)
+        micro_n = reference.limited(micro_n, l[0].precision_force_limit_n)
         macro_known_n -= joint_n
-        macro_known_n += forces.macro_force(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s, relative_m,
-                                            rate, f.macro_current_a, f.macro_force_n, felt_n, f.t_s, p)
+        macro_known_n += forces.macro_force(macro_m, macro_m_per_s, f.macro_acceleration_m_per_s2, q[0].macro_mass_kg,
+                                            relative_m, rate, a.macro_current_a, a.macro_force_n, felt_n,
+                                            t_s, dt_s, memory, p)
         if x.position_mode != 0.0:
             macro_n = q[0].macro_mass_kg * (later.acceleration_m_per_s2 - later.relative_acceleration_m_per_s2)
             macro_n -= macro_known_n
@@ -104,12 +126,16 @@ def decide(m, now, later, e, ahead, after, l, q, p):
             macro_n = law.carrier(l[0], a, f, x, now, later, q[0].macro_mass_kg, macro_known_n,
                                   a.macro_disturbance_n, q[0], x.period_s)
     else:
-        macro_known_n += forces.macro_force(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s, 0.0, 0.0,
-                                            f.macro_current_a, f.macro_force_n, 0.0, f.t_s, p)
+        macro_known_n += forces.macro_force(macro_m, macro_m_per_s, f.macro_acceleration_m_per_s2, q[0].macro_mass_kg,
+                                            0.0, 0.0, a.macro_current_a, a.macro_force_n, 0.0, t_s, dt_s, memory, p)
         macro_n = law.precision(l[0], a, f, x, now, later, q[0].macro_mass_kg, macro_known_n, a.macro_disturbance_n,
                                 q[0], x.period_s)
-    macro_n -= forces.macro_actuator(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s, relative_m, rate,
-                                     f.macro_current_a, macro_n, micro_n, f.t_s, p)
+    macro_n -= forces.macro_actuator(macro_m, macro_m_per_s, f.macro_acceleration_m_per_s2, q[0].macro_mass_kg,
+                                     relative_m, rate, a.macro_current_a, macro_n, micro_n, t_s, dt_s, memory, p)
+    k = q[0].macro_force_constant_n_per_a
+    macro_n -= k * forces.macro_command_at_once(macro_n / k, t_s, dt_s, memory, p)
+    if x.position_mode == 0.0:
+        macro_n = reference.limited(macro_n, l[0].macro_force_limit_n)
     return macro_n, micro_n
 
 

@@ -68,6 +68,8 @@ def middle(after, later, q, law, dt_s):
     """Take known forces at the reference: no noise, no feedback."""
     after.middle_end_position_m = later.position_m
     after.middle_end_velocity_m_per_s = later.velocity_m_per_s
+    after.end_acceleration_m_per_s2 = later.acceleration_m_per_s2
+    after.macro_acceleration_m_per_s2 = later.acceleration_m_per_s2 - later.relative_acceleration_m_per_s2
     after.middle_macro_position_m = later.position_m - later.relative_position_m + gap_centre(q)
     after.middle_macro_velocity_m_per_s = later.velocity_m_per_s - later.relative_velocity_m_per_s
     after.contact_side = 0.0

@@ -1,0 +1,181 @@
+"""What an effect is, and how one is declared: a function whose argument names are its declaration.
+
+Names that are quantities (`QUANTITIES_OF`) are what the effect depends on, every other argument is a parameter, and
+every name ends in its unit. The same text compiles for the tick and runs in analysis. Pure; knows no bus and no clock.
+
+An effect with memory takes `memory` as its last argument: a float64 slice of the length that the decorator states,
+zero at the start, read and written in place. It is advanced by `dt_s` with a step that is exact or implicit, so
+that it is stable for any `dt_s`, and returns its mean over the step. With `dt_s` = 0 it returns its present value
+and leaves its memory alone.
+"""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stagectl.compiled import compiled
+from stagectl.units import unit_of
+
+QUANTITIES = (
+    "position_m",  # of the axis that the effect acts on
+    "velocity_m_per_s",
+    "acceleration_m_per_s2",  # of the substep before: a force that needs the acceleration it causes would be a loop
+    "mass_kg",  # of the axis
+    "relative_position_m",  # end minus macro
+    "relative_velocity_m_per_s",
+    "current_a",  # of the axis' motor
+    "motor_force_n",  # force that the axis' current should make
+    "micro_motor_force_n",  # the voice coil's force, whichever axis the effect acts on
+    "t_s",  # since the start of the run
+    "dt_s",  # by which a memory is advanced; 0 = not at all
+)
+"""What a force or actuator effect may depend on."""
+
+JOINT_QUANTITIES = ("position_m", "velocity_m_per_s", "t_s", "dt_s")
+"""What a joint effect may depend on; position is end minus macro, velocity its rate."""
+
+CONTACT_QUANTITIES = (
+    "penetration_m",  # overlap of the joint's two parts, > 0 in contact
+    "penetration_velocity_m_per_s",
+    "contact_stiffness_n_per_m",  # of the side that touches
+    "contact_side_ratio",  # +1 right (macro ahead of the end), -1 left
+    "t_s",
+    "dt_s",
+)
+"""What a contact effect may depend on."""
+
+EDGE_QUANTITIES = ("contact_side_ratio", "t_s")
+"""What the place of an edge of the gap may depend on."""
+
+COMMAND_QUANTITIES = ("command_a", "t_s", "dt_s")
+"""What an effect on the way of the current command may depend on; time is that of the substep's start."""
+
+SENSOR_QUANTITIES = ("position_m", "velocity_m_per_s", "acceleration_m_per_s2", "t_s", "dt_s")
+"""What a sensor effect may depend on: true motion of the axis at the sample; `dt_s` since the sample before."""
+
+QUANTITIES_OF = {
+    "macro_force": QUANTITIES,  # N, positive in the direction of positive position
+    "micro_force": QUANTITIES,
+    "joint": JOINT_QUANTITIES,  # N on the end, the opposite on the macro
+    "contact": CONTACT_QUANTITIES,  # N that push the two parts of the joint apart; the sum never pulls
+    "contact_edge": EDGE_QUANTITIES,  # m by which an edge lies further out
+    "macro_actuator": QUANTITIES,  # N added to what the current should make
+    "micro_actuator": QUANTITIES,
+    "macro_command": COMMAND_QUANTITIES,  # A added to the commanded current, before the current loop
+    "micro_command": COMMAND_QUANTITIES,
+    "macro_sensor": SENSOR_QUANTITIES,  # m added to the reading
+    "end_sensor": SENSOR_QUANTITIES,
+}
+"""Every place at which an effect may act, and what it may depend on there."""
+
+PLACES = tuple(QUANTITIES_OF)
+"""Where an effect may act."""
+
+TAGS = ("structural", "session", "run")
+"""How long a parameter lives: as long as the machine, until the next homing or power-up, for one run."""
+
+_ALL_QUANTITIES = frozenset(name for names in QUANTITIES_OF.values() for name in names)
+_MEMORY = "memory"
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One declared law."""
+
+    name: str
+    law: Callable[..., float]
+    compiled_law: Callable[..., float]
+    quantities: tuple[str, ...]
+    parameters: tuple[str, ...]
+    places: tuple[str, ...]
+    bounds: dict[str, tuple[float, float]]
+    symptom: str
+    reference: str
+    memory: int  # floats
+    linear: tuple[str, ...]  # parameters that the output is linear in, all of them together
+    tags: dict[str, str]  # of every parameter, one of TAGS
+
+    @property
+    def summary(self) -> str:
+        """First line of the law's docstring."""
+        return (inspect.getdoc(self.law) or "").splitlines()[0]
+
+
+CATALOGUE: dict[str, Effect] = {}
+"""All declared effects by name."""
+
+
+def effect(
+    *,
+    places: tuple[str, ...],
+    symptom: str,
+    reference: str,
+    memory: int = 0,
+    linear: tuple[str, ...] = (),
+    session: tuple[str, ...] = (),
+    run: tuple[str, ...] = (),
+    **bounds: tuple[float, float],
+):
+    """Declare the decorated function as an effect; wrong declarations raise TypeError at import.
+
+    `memory`: length of its memory. `linear`: parameters that it is linear in. `session`, `run`: parameters that last
+    until the next homing, or for one run only; all others are structural.
+    """
+
+    def declare(law: Callable[..., float]) -> Callable[..., float]:
+        name = law.__name__
+        arguments = tuple(inspect.signature(law).parameters)
+        problem = _memory_problem(arguments, places, memory)
+        if arguments and arguments[-1] == _MEMORY:
+            arguments = arguments[:-1]
+        quantities = tuple(argument for argument in arguments if argument in _ALL_QUANTITIES)
+        parameters = tuple(argument for argument in arguments if argument not in _ALL_QUANTITIES)
+        problem = problem or _place_problem(quantities, places)
+        if name in CATALOGUE:
+            problem = "is declared twice"
+        elif arguments != quantities + parameters:
+            problem = f"quantities come before parameters, got {arguments}"
+        elif not inspect.getdoc(law):
+            problem = "no docstring; its first line is the summary in reports"
+        elif set(bounds) != set(parameters):
+            problem = f"bounds {sorted(bounds)} do not match parameters {sorted(parameters)}"
+        elif wrong := [key for key, (low, high) in bounds.items() if not -np.inf < low < high < np.inf]:
+            problem = f"bounds of {wrong[0]} are no range: {bounds[wrong[0]]}"
+        elif nameless := [argument for argument in arguments if unit_of(argument) is None]:
+            problem = f"argument {nameless[0]} states no unit"
+        elif strange := [key for key in (*linear, *session, *run) if key not in parameters]:
+            problem = f"{strange[0]} is tagged or linear, and is no parameter; there are {parameters}"
+        elif both := [key for key in session if key in run]:
+            problem = f"{both[0]} can't last for a session and for a run"
+        if problem:
+            raise TypeError(f"effect {name} {problem}" if problem[:2] == "is" else f"effect {name}: {problem}")
+        tags = {key: "session" if key in session else "run" if key in run else "structural" for key in parameters}
+        CATALOGUE[name] = Effect(
+            name, law, compiled(law), quantities, parameters, places, dict(bounds), symptom, reference,
+            memory, linear, tags,
+        )  # fmt: skip
+        return law
+
+    return declare
+
+
+def _memory_problem(arguments: tuple[str, ...], places: tuple[str, ...], memory: int) -> str:
+    takes = arguments[-1:] == (_MEMORY,)
+    if takes != (memory > 0):
+        return f"memory = {memory} in the decorator, and the law {'takes' if takes else 'does not take'} a memory"
+    if takes and "dt_s" not in arguments:
+        return "a law with memory advances it by dt_s"
+    if takes and "contact_edge" in places:
+        return "the place of an edge has no memory: both edges are asked in every substep"
+    return ""
+
+
+def _place_problem(quantities: tuple[str, ...], places: tuple[str, ...]) -> str:
+    for place in places:
+        if place not in QUANTITIES_OF:
+            return f"unknown place {place}; choose from {PLACES}"
+        if strange := [name for name in quantities if name not in QUANTITIES_OF[place]]:
+            return f"{strange[0]} is not known at {place}; there a law may depend on {QUANTITIES_OF[place]}"
+    return "" if places else "no place to act at"

@@ -1,0 +1,107 @@
+"""From the commanded current to the motor's force: dead band, lag and delay of the command, the force constant.
+
+Command effects add amperes to what the drive is told; actuator effects add newtons to what its current should make.
+"""
+
+import numpy as np
+
+from stagectl.effects.declaration import effect
+
+_ACTUATORS = ("macro_actuator", "micro_actuator")
+_COMMANDS = ("macro_command", "micro_command")
+_CHANGES_COUNT = 8  # of the command that are on their way at once
+
+
+@effect(
+    places=_ACTUATORS,
+    error_ratio=(-0.2, 0.2),
+    linear=("error_ratio",),
+    symptom="proportional to the motor's force",
+    reference="Kang et al. 2023, (4), K_m",
+)
+def force_constant_error(motor_force_n, error_ratio):
+    """Force constant that differs from its nominal value: F = epsilon F_nominal."""
+    return error_ratio * motor_force_n
+
+
+@effect(
+    places=_ACTUATORS,
+    saturation_n=(1.0, 1e6),
+    symptom="odd in the motor's force, with its cube: the force constant falls where the current is large",
+    reference="Gieras, Piech, Zhou, Linear Synchronous Motors, section 3.6: iron that saturates; tanh as its curve",
+)
+def force_constant_saturation(motor_force_n, saturation_n):
+    """Force that saturates: in all F_s tanh(F / F_s), so F_s tanh(F / F_s) - F is added, about -F^3 / (3 F_s^2)."""
+    return saturation_n * np.tanh(motor_force_n / saturation_n) - motor_force_n
+
+
+@effect(
+    places=_COMMANDS,
+    half_width_a=(0.0, 10.0),
+    symptom="no force for small commands, and a constant part missing of larger ones",
+    reference="Slotine, Li, Applied Nonlinear Control, section 5.2: dead zone; amplifiers without bias current",
+)
+def amplifier_dead_band(command_a, half_width_a):
+    """Dead band: 0 for |i| < d, i - d sgn i beyond, so -i is added, held within +-d."""
+    return -np.minimum(np.maximum(command_a, -half_width_a), half_width_a)
+
+
+@effect(
+    places=_COMMANDS,
+    memory=1,
+    time_constant_s=(1e-6, 0.02),
+    symptom="proportional to the change of the command; fades with one time constant",
+    reference="Franklin, Powell, Workman, Digital Control of Dynamic Systems, section 4.3: first-order lag, held input",
+)
+def current_loop_lag(command_a, dt_s, time_constant_s, memory):
+    """Lag of the drive besides its nominal current loop: y' = (i - y) / tau, and y - i is added.
+
+    memory: y. The drive's command is held over a step, so the step is exact; what is added is its mean.
+    """
+    apart = memory[0] - command_a
+    if not dt_s > 0.0:
+        return apart
+    left = np.exp(-dt_s / time_constant_s)
+    memory[0] = command_a + apart * left
+    return apart * (1.0 - left) * time_constant_s / dt_s
+
+
+@effect(
+    places=_COMMANDS,
+    memory=2 + 2 * _CHANGES_COUNT,
+    delay_s=(0.0, 0.005),
+    symptom="the command's change, times the delay; the same for slow and for fast commands",
+    reference="Astrom, Wittenmark, Computer-Controlled Systems, section 2.3: dead time with a held input",
+)
+def command_delay(command_a, t_s, dt_s, delay_s, memory):
+    """Dead time of the drive: i(t - T), and i(t - T) - i is added.
+
+    memory: the command at t - T; how many changes are on their way; (instant, command) of each. What is added is the
+    mean over the step, exact for held commands. More than 8 changes within T: the newest takes over the last one's
+    instant.
+    """
+    count = int(memory[1])
+    if dt_s > 0.0 and command_a != (memory[0] if count == 0 else memory[1 + 2 * count]):
+        if count < _CHANGES_COUNT:
+            memory[2 + 2 * count] = t_s
+            count += 1
+        memory[1 + 2 * count] = command_a
+    at_s = t_s - delay_s
+    end_s = at_s + dt_s
+    value = memory[0]
+    area = 0.0
+    passed = 0
+    while passed < count and memory[2 + 2 * passed] <= end_s:
+        change_s = max(memory[2 + 2 * passed], at_s)
+        area += value * (change_s - at_s)
+        at_s = change_s
+        value = memory[3 + 2 * passed]
+        passed += 1
+    if not dt_s > 0.0:
+        return value - command_a
+    area += value * (end_s - at_s)
+    memory[0] = value
+    memory[1] = count - passed
+    for k in range(2 * (count - passed)):
+        memory[2 + k] = memory[2 + k + 2 * passed]
+    return area / dt_s - command_a

@@ -1,0 +1,102 @@
+"""Forces that depend on where the stage is: springs, cables, tilt, and friction that changes along the way."""
+
+import numpy as np
+
+from stagectl.effects.declaration import effect
+
+_AXES = ("macro_force", "micro_force")
+_GRAVITY_M_PER_S2 = 9.80665  # standard gravity, ISO 80000-3
+
+
+@effect(
+    places=_AXES,
+    force_n=(-1e3, 1e3),
+    linear=("force_n",),
+    symptom="constant",
+    reference="Newton; tilt, amplifier offset and preload look alike",
+)
+def offset(t_s, force_n):
+    """Constant force."""
+    return force_n + 0.0 * t_s
+
+
+@effect(
+    places=_AXES,
+    grade_ratio=(-0.2, 0.2),
+    linear=("grade_ratio",),
+    symptom="constant, and on both axes in the ratio of their masses",
+    reference="Newton; weight along a plane of sine g",
+)
+def gravity_tilt(mass_kg, grade_ratio):
+    """Weight along a tilted way: F = -m g sin(tilt); `grade_ratio` is the sine, positive where the way climbs."""
+    return -mass_kg * _GRAVITY_M_PER_S2 * grade_ratio
+
+
+@effect(
+    places=_AXES,
+    stiffness_n_per_m=(0.0, 1e4),
+    anchor_m=(-10.0, 10.0),
+    linear=("stiffness_n_per_m",),
+    session=("anchor_m",),
+    symptom="linear in position",
+    reference="Hooke; cable carriers of linear stages",
+)
+def cable_spring(position_m, stiffness_n_per_m, anchor_m):
+    """Pull of a cable towards its anchor: F = -k (x - x_0)."""
+    return -stiffness_n_per_m * (position_m - anchor_m)
+
+
+@effect(
+    places=_AXES,
+    memory=1,
+    level_n=(0.0, 1e3),
+    slip_m=(1e-5, 0.5),
+    linear=("level_n",),
+    symptom="a spring over the first millimetres after each reversal, then a constant drag",
+    reference="Al-Bender, Lampaert, Swevers, IEEE Trans. Automatic Control 50(11), 2005: one Maxwell-slip element",
+)
+def cable_hysteresis(velocity_m_per_s, dt_s, level_n, slip_m, memory):
+    """Hysteresis of a cable, a spring that slips: F = -F_s z / delta, z follows x and is held within +-delta.
+
+    memory: z / delta. Its step is exact for constant v, but for the part of a substep in which it begins to slip.
+    """
+    z = memory[0]
+    memory[0] = min(max(z + velocity_m_per_s * dt_s / slip_m, -1.0), 1.0)
+    return -0.5 * level_n * (z + memory[0])
+
+
+@effect(
+    places=(*_AXES, "joint"),
+    stiffness_n_per_m=(-1e6, 1e6),
+    linear=("stiffness_n_per_m",),
+    symptom="linear in position, zero at zero; on the joint in the relative position, opposite on both axes",
+    reference="Hooke; Kang et al. 2023, (1) and (2), K1 and K2",
+)
+def linear_stiffness(position_m, stiffness_n_per_m):
+    """Spring about zero: F = -k x. On the joint x is end minus macro, and k is what its spring is stiffer."""
+    return -stiffness_n_per_m * position_m
+
+
+@effect(
+    places=(*_AXES, "joint"),
+    stiffness_n_per_m3=(-1e13, 1e13),
+    linear=("stiffness_n_per_m3",),
+    symptom="with the cube of the position; on the joint in the relative position, opposite on both axes",
+    reference="Duffing 1918; Awtar, Slocum, Sevincer, J. Mech. Design 129(6), 2007: flexures stiffen with the square",
+)
+def cubic_stiffness(position_m, stiffness_n_per_m3):
+    """Spring that stiffens: F = -k x^3. On the joint x is end minus macro: a flexure guide."""
+    return -stiffness_n_per_m3 * position_m * position_m * position_m
+
+
+@effect(
+    places=_AXES,
+    slope_n_per_m=(-1e4, 1e4),
+    smoothing_m_per_s=(1e-7, 1e-1),
+    linear=("slope_n_per_m",),
+    symptom="a step at each reversal that grows along the way",
+    reference="Armstrong-Helouvry, Control of Machines with Friction, 1991, chapter 4: friction as a function of position",
+)
+def position_dependent_friction(position_m, velocity_m_per_s, slope_n_per_m, smoothing_m_per_s):
+    """Dry friction that changes along the way: F = -k x tanh(v / v_s), beside a Coulomb friction that it adds to."""
+    return -slope_n_per_m * position_m * np.tanh(velocity_m_per_s / smoothing_m_per_s)
