@@ -10,7 +10,8 @@ import numpy as np
 
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap import innovations
-from stagectl.gap.believed import Believed
+from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.evaluation import evaluated
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
 from stagectl.gap.motion import PARTS_COUNT, Motion, delayed, lagged, motion_of
@@ -67,11 +68,26 @@ class Recording:
             raise KeyError(axis)
         return position
 
+    def belief(self, axis: str) -> BelievedAxis:
+        """What is believed of one body and its motor."""
+        if axis == "macro" or self.believed.micro is None:
+            return self.believed.macro
+        return self.believed.micro
+
     def mass_kg(self, axis: str) -> float:
         """Believed mass of one body."""
-        if axis == "macro" or self.believed.micro is None:
-            return self.believed.macro.mass_kg
-        return self.believed.micro.mass_kg
+        return self.belief(axis).mass_kg
+
+    def force_constant_n_per_a(self, axis: str) -> float:
+        """Believed force constant of one motor."""
+        return self.belief(axis).force_constant_n_per_a
+
+    def held_command_n(self, axis: str) -> np.ndarray:
+        """Commanded force as the drive holds it, before its current loop, shape (n, parts)."""
+        command_n = self.log.macro_command_n if axis == "macro" else self.log.micro_command_n
+        if command_n is None:
+            return np.zeros_like(self.macro.position_m)
+        return delayed(command_n, self.log.latch_s / self.log.period_s)
 
 
 def recording_of(log: Log, believed: Believed) -> Recording:
@@ -179,29 +195,35 @@ def add(total: Forces, more: Forces) -> None:
             setattr(total, name, extra if held is None else held + extra)
 
 
-def quantities(recording: Recording, axis: str) -> dict[str, np.ndarray]:
-    """Everything that a force law of one body may ask for, on parts of intervals."""
+def quantities(recording: Recording, axis: str, place: str) -> dict[str, np.ndarray]:
+    """Everything that a law at one place may ask for, on parts of intervals."""
     motion = recording.motion(axis)
-    n = recording.log.samples_count
-    t_s = recording.log.times_s[:, None] + (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * recording.log.period_s
-    zero = np.zeros((n, PARTS_COUNT))
+    h = recording.log.period_s
+    whole = np.ones_like(motion.position_m)
+    relative = recording.end if recording.end is not None else recording.macro
+    relative_m = relative.position_m - recording.macro.position_m
+    relative_m_per_s = relative.velocity_m_per_s - recording.macro.velocity_m_per_s
     motor_n = recording.macro_command_n if axis == "macro" else recording.micro_command_n
+    motor_n = 0.0 * whole if motor_n is None else motor_n
+    at_sample = place.endswith("_sensor")
     known = {
-        "position_m": motion.position_m,
-        "velocity_m_per_s": motion.velocity_m_per_s,
+        "position_m": relative_m if place == "joint" else motion.position_m,
+        "velocity_m_per_s": relative_m_per_s if place == "joint" else motion.velocity_m_per_s,
         "acceleration_m_per_s2": motion.acceleration_m_per_s2,
-        "relative_position_m": zero,
-        "relative_velocity_m_per_s": zero,
-        "motor_force_n": zero if motor_n is None else motor_n,
-        "current_a": zero if motor_n is None else motor_n,  # per unit of force constant: amplitudes count in newtons
-        "micro_motor_force_n": zero if recording.micro_command_n is None else recording.micro_command_n,
-        "mass_kg": zero + recording.mass_kg(axis),
-        "t_s": t_s,
-        "dt_s": zero + recording.log.period_s / PARTS_COUNT,
+        "relative_position_m": relative_m,
+        "relative_velocity_m_per_s": relative_m_per_s,
+        "motor_force_n": motor_n,
+        "current_a": motor_n / recording.force_constant_n_per_a(axis),
+        "command_a": recording.held_command_n(axis) / recording.force_constant_n_per_a(axis),
+        "micro_motor_force_n": 0.0 * whole if recording.micro_command_n is None else recording.micro_command_n,
+        "mass_kg": recording.mass_kg(axis) * whole,
+        "t_s": recording.log.times_s[:, None] + (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * h,
+        "dt_s": h / PARTS_COUNT * whole,
     }
-    if recording.end is not None:
-        known["relative_position_m"] = recording.end.position_m - recording.macro.position_m
-        known["relative_velocity_m_per_s"] = recording.end.velocity_m_per_s - recording.macro.velocity_m_per_s
+    if at_sample:  # a reading is of the sample's instant, which begins its interval
+        position_m = recording.position_m(axis)[:, None] * whole
+        velocity = np.gradient(motion.position_m.mean(axis=1), h)
+        known |= {"position_m": position_m, "velocity_m_per_s": _at_samples(motion.velocity_m_per_s, velocity)}
     joint = recording.believed.joint
     if joint is not None and recording.side is not None:
         known["penetration_m"] = recording.penetration_m
@@ -213,23 +235,49 @@ def quantities(recording: Recording, axis: str) -> dict[str, np.ndarray]:
     return known
 
 
+def _at_samples(fine: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+    """Bring values at middles of parts back to the instants that begin the intervals."""
+    flat = fine.ravel()
+    parts = fine.shape[1]
+    starts = np.empty(fine.shape[0])
+    starts[1:] = 0.5 * (flat[parts::parts] + flat[parts - 1 : -1 : parts])
+    starts[0] = flat[0] if np.isfinite(flat[0]) else fallback[0]
+    return starts[:, None] * np.ones((1, parts))
+
+
 def effect_forces(recording: Recording, effect: Effect, place: str, parameters: list[float]) -> Forces:
-    """Evaluate one effect along the measured motion."""
+    """Evaluate one effect along the measured motion, and put it where it acts."""
     axis = "macro" if place.startswith("macro") else "end"
-    known = quantities(recording, axis)
+    known = quantities(recording, axis, place)
     value = evaluated(effect, [known[name] for name in effect.quantities], parameters)
-    if place == "contact":
-        side = recording.side
-        if side is None:
-            raise KeyError("contact")
-        push_n = side * value * (side != 0.0)
+    if place in ("contact", "contact_edge", "joint"):
+        if place == "joint":
+            push_n = value
+        elif recording.side is None:
+            push_n = np.zeros_like(value)
+        else:
+            push_n = recording.side * value
+            if place == "contact_edge":  # an edge further out is a joint that overlaps less
+                push_n = -push_n * known["contact_stiffness_n_per_m"]
         return Forces(macro_n=-push_n, end_n=push_n)
     if place.endswith("_sensor"):
-        sampled = value[:, 0]
-        return Forces(macro_sensor_m=sampled) if axis == "macro" else Forces(end_sensor_m=sampled)
+        return _misread(recording, axis, value)
+    if place.endswith("_command"):
+        value = lagged(
+            value * recording.force_constant_n_per_a(axis), recording.belief(axis).current_loop_s, recording.log.period_s
+        )
     return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
 
 
-def evaluated(effect: Effect, arguments: list[np.ndarray], parameters: list[float]) -> np.ndarray:
-    """Run a law along a recording, in time order where it has a memory."""
-    return np.asarray(effect.law(*arguments, *parameters), float) + np.zeros_like(arguments[0])
+def _misread(recording: Recording, axis: str, error_m: np.ndarray) -> Forces:
+    """Return what a sensor error does: to the position, and to the joint's forces that were taken at a wrong place."""
+    sampled_m = np.ascontiguousarray(error_m[:, 0])
+    joint = recording.believed.joint
+    forces = Forces(macro_sensor_m=sampled_m) if axis == "macro" else Forces(end_sensor_m=sampled_m)
+    if joint is not None and recording.side is not None:
+        stiffness = joint.spring_n_per_m + np.where(
+            recording.side > 0.0, joint.right_stiffness_n_per_m, np.where(recording.side < 0.0, joint.left_stiffness_n_per_m, 0.0)
+        )
+        forces.end_n = stiffness * error_m * (1.0 if axis == "end" else -1.0)
+        forces.macro_n = -forces.end_n
+    return forces

@@ -40,6 +40,7 @@ class BelievedAxis:
     mass_sd_kg: float
     noise_m: float
     current_loop_s: float
+    force_constant_n_per_a: float = 1.0
     force_constant_sd_ratio: float = FORCE_CONSTANT_SD_RATIO
 
 
@@ -157,11 +158,21 @@ def believed_of_profile(profile: Profile) -> Believed:
     """Take the belief out of a profile."""
     noise_m = profile.interferometer.noise_m
     macro = BelievedAxis(
-        profile.macro.mass_kg, profile.macro.mass_sd_kg, noise_m, profile.macro.current_loop_s
+        profile.macro.mass_kg,
+        profile.macro.mass_sd_kg,
+        noise_m,
+        profile.macro.current_loop_s,
+        profile.macro.rated_force_n / profile.macro.rated_current_a,
     )
     micro = joint = None
     if profile.micro is not None and profile.backlash is not None:
-        micro = BelievedAxis(profile.micro.mass_kg, profile.micro.mass_sd_kg, noise_m, profile.micro.current_loop_s)
+        micro = BelievedAxis(
+            profile.micro.mass_kg,
+            profile.micro.mass_sd_kg,
+            noise_m,
+            profile.micro.current_loop_s,
+            profile.micro.rated_force_n / profile.micro.rated_current_a,
+        )
         backlash = profile.backlash
         joint = BelievedJoint(
             profile.micro.spring_n_per_m,

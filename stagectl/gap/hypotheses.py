@@ -24,7 +24,7 @@ class Term:
     shape: dict[str, float]
     amplitudes: tuple[str, ...]
     forces: Callable[[Recording], list[Forces]]
-    per_session: bool = False
+    scope: str = "structural"
     bounds: tuple[tuple[float, float], ...] = ()
 
     @property
@@ -37,6 +37,18 @@ class Term:
         """For people."""
         shape = ", ".join(f"{name} = {value:.4g}" for name, value in self.shape.items())
         return f"{self.name} on {self.acts_on}" + (f" ({shape})" if shape else "")
+
+
+AS_PARAMETERS = frozenset(
+    {
+        "mass_error",
+        "force_constant_error",
+        "contact_stiffness_error",
+        "backlash_width_change",
+        "backlash_centre_shift",
+    }
+)
+"""Effects that say the same as a known parameter that is wrong: `parameter_terms` has them."""
 
 
 def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
@@ -122,10 +134,14 @@ def effect_terms(recordings: list[Recording], grids: dict[str, list[dict[str, fl
     has_micro = all(r.end is not None for r in recordings)
     present = {(row["name"], row["acts_on"]) for row in recordings[0].believed.effects}
     for effect in CATALOGUE.values():
-        if "pitch_m" in effect.parameters or "frequency_hz" in effect.parameters:
+        if "pitch_m" in effect.parameters or effect.name == "base_vibration":
             continue  # searched by what stands out: `periodic_terms`
+        if effect.name in AS_PARAMETERS:
+            continue
         for place in effect.places:
             if not has_micro and (not place.startswith("macro") or _needs_micro(effect)):
+                continue
+            if place.startswith("contact") and recordings[0].side is None:
                 continue
             if (effect.name, place) in present:
                 continue
@@ -142,9 +158,9 @@ def periodic_terms(
         for place in effect.places:
             if not place.startswith(force.removesuffix("_force")):
                 continue
-            if "pitch_m" in effect.parameters:
+            if "pitch_m" in effect.parameters and "second_n" not in effect.parameters:
                 yield from (term_of(effect, place, {"pitch_m": pitch}) for pitch in pitches_m)
-            elif "frequency_hz" in effect.parameters:
+            elif effect.name == "base_vibration":
                 yield from (term_of(effect, place, {"frequency_hz": f}) for f in frequencies_hz)
 
 
@@ -153,17 +169,25 @@ def _needs_micro(effect: Effect) -> bool:
 
 
 def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
-    """Make the term of one effect: linear parameters become columns, a phase a pair of them."""
+    """Make the term of one effect with its shape fixed.
+
+    Parameters that the output is linear in become columns, an amplitude with a phase a pair of them. An effect that is
+    linear in nothing (a delay, a knee) is one column at its shape; its amplitude should come out as one.
+    """
     linear = [name for name in effect.linear if name not in shape]
-    with_phase = "phase_rad" in effect.parameters and "phase_rad" not in shape
     settings: list[dict[str, float]] = []
+    amplitudes: list[str] = []
     for name in linear:
-        for phase in (0.0, 0.5 * np.pi) if with_phase else (None,):
-            values = dict.fromkeys(linear, 0.0) | {name: 1.0} | shape
-            if phase is not None:
-                values["phase_rad"] = phase
+        phase = _phase_of(effect, name)
+        for angle in (0.0, 0.5 * np.pi) if phase else (None,):
+            others = {p: 0.0 for p in effect.parameters if p.endswith("phase_rad")}
+            values = others | dict.fromkeys(linear, 0.0) | {name: 1.0} | shape
+            if phase and angle is not None:
+                values[phase] = angle
             settings.append(values)
-    amplitudes = tuple(f"{name}*" if with_phase else name for name in linear for _ in range(2 if with_phase else 1))
+            amplitudes.append(f"{name}*" if phase else name)
+    if not linear:
+        settings, amplitudes = [dict(shape)], ["share_of_shape_ratio"]
 
     def forces(r: Recording) -> list[Forces]:
         return [
@@ -171,9 +195,27 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
             for values in settings
         ]
 
-    per_session = any(tag == "session" for tag in effect.tags.values())
-    bounds = () if with_phase else tuple(effect.bounds[name] for name in linear)
-    return Term(effect.name, place, dict(shape), amplitudes, forces, per_session, bounds)
+    scope = "structural"
+    for tag in ("session", "run"):
+        if tag in effect.tags.values():
+            scope = tag
+    bounds = (
+        tuple((-effect.bounds[name.removesuffix("*")][1], effect.bounds[name.removesuffix("*")][1]) for name in amplitudes)
+        if any(name.endswith("*") for name in amplitudes)
+        else tuple(effect.bounds[name] for name in linear) or _SHARE_BOUNDS.get(effect.name, ((0.0, 1e3),))
+    )
+    return Term(effect.name, place, dict(shape), tuple(amplitudes), forces, scope, bounds)
+
+
+_SHARE_BOUNDS: dict[str, tuple[tuple[float, float], ...]] = {"sensor_delay": ((-1e3, 1e3),)}
+
+
+def _phase_of(effect: Effect, amplitude: str) -> str | None:
+    """Return the parameter that is the phase of an amplitude."""
+    for name in (f"{amplitude.split('_')[0]}_phase_rad", "phase_rad"):
+        if name in effect.parameters:
+            return name
+    return None
 
 
 _KNOTS_COUNT = 12
@@ -185,14 +227,14 @@ def curve_terms(recordings: list[Recording]) -> Iterator[Term]:
     axes = recordings[0].axes
     for axis in axes:
         for quantity in (*_CURVES, *(("relative_position_m",) if len(axes) > 1 else ())):
-            spans = [balance.quantities(r, axis)[quantity] for r in recordings]
+            spans = [balance.quantities(r, axis, "macro_force")[quantity] for r in recordings]
             low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
             if not high > low:
                 continue
             knots = np.linspace(low, high, _KNOTS_COUNT)
 
             def forces(r: Recording, axis: str = axis, quantity: str = quantity, knots: np.ndarray = knots) -> list[Forces]:
-                value = balance.quantities(r, axis)[quantity]
+                value = balance.quantities(r, axis, "macro_force")[quantity]
                 hats = [np.interp(value, knots, np.eye(_KNOTS_COUNT)[k]) for k in range(_KNOTS_COUNT)]
                 return [Forces(macro_n=hat) if axis == "macro" else Forces(end_n=hat) for hat in hats]
 

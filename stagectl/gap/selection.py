@@ -20,6 +20,8 @@ ALIAS_GAIN = 9.0
 _ALIAS_SHARE = 0.03
 _JITTER = 1e-10
 _BOUND_SDS = 2.0
+_AGREE_SDS = 4.0
+_AGREE_RATIO = 0.35
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,16 +31,18 @@ class Sums:
     gram: np.ndarray
     count: float
     session: str
+    run: str
+    nulls: np.ndarray  # what the columns make of white noise in the innovations' place, shape (draws, columns)
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Columns that stay or go together; `prior_sd` > 0 where their amplitude is known so well."""
+    """Columns that stay or go together; `prior_sds` says how far each amplitude may be from zero, inf = any."""
 
     key: object
     columns: tuple[int, ...]
-    per_session: bool = False
-    prior_sd: float = 0.0
+    scope: str = "structural"  # structural | session | run: how far its amplitudes reach
+    prior_sds: tuple[float, ...] = ()
     bounds: tuple[tuple[float, float], ...] = ()  # of each amplitude; a friction that drives is no friction
 
 
@@ -47,7 +51,7 @@ class Solution:
     """Amplitudes of some groups on some recordings, and what they gain over none at all."""
 
     groups: tuple[Group, ...]
-    slots: tuple[tuple[int, str], ...]  # (column, session or "")
+    slots: tuple[tuple[int, str], ...]  # (column, "" or the session or run that it is of)
     values: np.ndarray
     covariance: np.ndarray
     gain: float
@@ -60,19 +64,23 @@ class Solution:
 
 def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
     """Solve the amplitudes of `groups` on all of `sums`."""
-    sessions = sorted({s.session for s in sums})
+    scopes = {
+        "structural": ("",),
+        "session": tuple(sorted({f"session {s.session}" for s in sums})),
+        "run": tuple(sorted({f"run {s.run}" for s in sums})),
+    }
     slots: list[tuple[int, str]] = []
     precision: list[float] = []
     for group in groups:
-        for session in sessions if group.per_session else ("",):
-            for column in group.columns:
-                slots.append((column, session))
-                precision.append(group.prior_sd**-2 if group.prior_sd > 0.0 else 0.0)
+        for scope in scopes[group.scope]:
+            for number, column in enumerate(group.columns):
+                slots.append((column, scope))
+                precision.append(group.prior_sds[number] ** -2 if group.prior_sds else 0.0)
     size = len(slots)
     normal = np.diag(np.array(precision)) if size else np.zeros((0, 0))
     right = np.zeros(size)
     for s in sums:
-        here = [k for k, (_, session) in enumerate(slots) if session in ("", s.session)]
+        here = [k for k, (_, scope) in enumerate(slots) if scope in ("", f"session {s.session}", f"run {s.run}")]
         columns = [slots[k][0] for k in here]
         normal[np.ix_(here, here)] += s.gram[np.ix_(columns, columns)]
         right[here] += s.gram[columns, 0]
@@ -103,8 +111,8 @@ def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
 
     Amplitudes that belong to a session are solved there, and cost what so many free amplitudes gain on noise.
     """
-    fixed = [k for k, (_, session) in enumerate(solution.slots) if session == ""]
-    own = sorted({column for column, session in solution.slots if session != ""})
+    fixed = [k for k, (_, scope) in enumerate(solution.slots) if scope == ""]
+    own = sorted({column for column, scope in solution.slots if scope != ""})
     total = 0.0
     columns = [solution.slots[k][0] for k in fixed]
     theta = solution.values[fixed]
@@ -146,14 +154,12 @@ class Judge:
             apart += held_out_gain(solve([*self.base, *groups], others), [training[k]])
         return whole.gain, apart
 
-    def calibrate(self, draws_count: int, seed: int) -> None:
-        """Set thresholds: the quantile of the best gains of the whole library on noise, 200 draws and more."""
-        random = np.random.default_rng(seed)
+    def calibrate(self) -> None:
+        """Set thresholds: the quantile of the best gains of the whole library on noise."""
+        draws_count = self.training[0].nulls.shape[0]
         best = np.zeros((draws_count, 2))
-        roots = {id(s): _root(s.gram[1:, 1:]) for s in [*self.training, *self.held]}
         for k in range(draws_count):
-            noise = [[_with_noise(s, roots[id(s)], random) for s in part] for part in (self.training, self.held)]
-            sums = (noise[0], noise[1])
+            sums = ([_on_noise(s, k) for s in self.training], [_on_noise(s, k) for s in self.held])
             none = self.gains([], sums)
             gains = [self.gains([group], sums) for group in self.library]
             best[k] = max(g[0] - none[0] for g in gains), max(g[1] - none[1] for g in gains)
@@ -180,8 +186,9 @@ class Judge:
                     continue
                 gains = self.gains([*chosen, group])
                 ranked.append((gains[0] - now[0], gains[1] - now[1], group))
-            passing = [row for row in ranked if self._stays(row[0], row[1], left)]
-            best = max(passing, key=lambda row: row[0] + row[1] - 2.0 * len(row[2].columns), default=None)
+            passing = [row for row in ranked if self._stays(row[0], row[1], left) and self._agrees(chosen, row[2])]
+            price = self._price()
+            best = max(passing, key=lambda row: row[0] + row[1] - price * len(row[2].columns), default=None)
             top = sorted(ranked, key=lambda row: -(row[0] + row[1]))[:4]
             self.trace.append(
                 f"left {left[0]:.0f} / {left[1]:.0f}: "
@@ -190,13 +197,69 @@ class Judge:
             if best is None:
                 break
             chosen.append(best[2])
-            chosen = self._without_superfluous(chosen)
+            chosen = self._without_superfluous(self._swapped(chosen))
+        return self._simplest(chosen)
+
+    def _price(self) -> float:
+        """Return what an amplitude must gain to be worth itself (Schwarz 1978)."""
+        return float(np.log(sum(s.count for s in self.training)))
+
+    def _worth(self, groups: Sequence[Group]) -> float:
+        """Return gains on both kinds of recordings, less the price of the amplitudes."""
+        trained, apart = self.gains(groups)
+        return trained + apart - self._price() * sum(len(group.columns) for group in groups)
+
+    def _allowed(self, groups: Sequence[Group]) -> bool:
+        return within_bounds(solve([*self.base, *groups], self.training))
+
+    def _swapped(self, chosen: list[Group]) -> list[Group]:
+        """Exchange single terms as long as that is worth more: what came first need not be what is true."""
+        for _ in range(2 * len(chosen)):
+            now, best, better = self._worth(chosen), chosen, 0.0
+            for k, group in enumerate(chosen):
+                taken = {other.key for other in chosen if other is not group}
+                for other in self.library:
+                    if other is group or other.key in taken:
+                        continue
+                    instead = [*chosen[:k], other, *chosen[k + 1 :]]
+                    gain = self._worth(instead) - now
+                    if gain > max(better, ALIAS_GAIN) and self._allowed(instead):
+                        best, better = instead, gain
+            if best is chosen:
+                break
+            chosen = best
         return chosen
 
+    def _simplest(self, chosen: list[Group]) -> list[Group]:
+        """Take a term with fewer amplitudes wherever it does as well: a superset loses ties."""
+        for k, group in enumerate(chosen):
+            rest = [other for other in chosen if other is not group]
+            now, without = sum(self.gains(chosen)), sum(self.gains(rest))
+            for other in sorted(self.library, key=lambda g: len(g.columns)):
+                if len(other.columns) >= len(group.columns) or other.key in {g.key for g in rest}:
+                    continue
+                instead = [*chosen[:k], other, *chosen[k + 1 :]]
+                if now - sum(self.gains(instead)) < max(ALIAS_GAIN, _ALIAS_SHARE * (now - without)):
+                    if self._allowed(instead):
+                        chosen = instead
+                        break
+        return chosen
+
+    def _agrees(self, chosen: Sequence[Group], group: Group) -> bool:
+        """Tell whether training and held-out recordings ask for the same amplitudes: a law does not change with them."""
+        if not self.held or group.scope != "structural":
+            return True
+        values = [solve([*self.base, *chosen, group], part).of(group) for part in (self.training, self.held)]
+        (a, a_sd), (b, b_sd) = values
+        allowed = np.maximum(_AGREE_SDS * np.hypot(a_sd, b_sd), _AGREE_RATIO * np.maximum(np.abs(a), np.abs(b)))
+        return bool(np.all(np.abs(a - b) <= allowed))
+
     def _stays(self, trained: float, apart: float, left: tuple[float, float]) -> bool:
-        return (
-            trained > max(self.thresholds[0], MATERIAL_RATIO * left[0])
-            and apart > max(self.thresholds[1], MATERIAL_RATIO * left[1])
+        """Tell whether gains are beyond noise, and material beside what is left, on whichever side more is left."""
+        counts = [sum(s.count for s in part) for part in (self.training, self.held or self.training)]
+        share = MATERIAL_RATIO * max(left[0] / counts[0], left[1] / counts[1])
+        return trained > max(self.thresholds[0], share * counts[0]) and apart > max(
+            self.thresholds[1], share * counts[1]
         )
 
     def _without_superfluous(self, chosen: list[Group]) -> list[Group]:
@@ -235,15 +298,9 @@ class Judge:
         return sorted(((key, margin) for key, margin in margins.items() if margin < limit), key=lambda row: row[1])
 
 
-def _root(gram: np.ndarray) -> np.ndarray:
-    """Return R with R R' = gram, for drawing noise seen through the columns."""
-    values, vectors = np.linalg.eigh(gram)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
-
-
-def _with_noise(s: Sums, root: np.ndarray, random: np.random.Generator) -> Sums:
+def _on_noise(s: Sums, draw: int) -> Sums:
+    """Return the sums that one draw of noise would have given."""
     gram = s.gram.copy()
-    seen = root @ random.standard_normal(root.shape[1])
-    gram[0, 1:] = gram[1:, 0] = seen
+    gram[0, 1:] = gram[1:, 0] = s.nulls[draw]
     gram[0, 0] = s.count
-    return Sums(gram, s.count, s.session)
+    return Sums(gram, s.count, s.session, s.run, s.nulls)

@@ -21,6 +21,7 @@ from stagectl.gap.log import Log
 from stagectl.gap.selection import Group, Judge, Solution, Sums, solve
 
 _AR_ORDER = 12
+_REST_PASSES = 3
 _CORNER_RAD_PER_S = 2.0 * np.pi * 2.0
 _FORCE_N = 0.05
 _EXCITED_GAIN = 1e-6
@@ -95,13 +96,20 @@ def find(
     grids = grids_for(recordings)
     terms = list(hypotheses.effect_terms(recordings, grids))
     say("looking for what repeats in position and time")
-    terms += _periodic_terms(recordings, base, terms, curves)
+    fixed = [term for term, _ in base] + terms + curves
+    blocks = [_columns(recording, fixed) for recording in recordings]
+    periodic = _periodic_terms(recordings, blocks, base, terms, curves)
+    blocks = [
+        np.column_stack([block, *(balance.column(r, f) for term in periodic for f in term.forces(r))])
+        for block, r in zip(blocks, recordings, strict=True)
+    ]
     say(f"{len(terms)} hypotheses of {len({term.key for term in terms})} effects on {len(logs)} recordings")
-    layout, sums = _sums(recordings, base, terms, curves)
+    layout, sums = _sums(recordings, blocks, base, terms, curves, periodic, nulls_count, seed)
+    terms += periodic
     groups = layout.groups
     judge = Judge(sums[: len(training)], sums[len(training) :], groups["base"], groups["library"])
     say("what the library gains on noise")
-    judge.calibrate(nulls_count, seed)
+    judge.calibrate()
     say("effects compete")
     before = judge.reducible([])
     chosen = judge.select()
@@ -147,35 +155,50 @@ class Layout:
 
 
 def _sums(
-    recordings: Sequence[Recording], base: list[tuple[Term, float]], terms: list[Term], curves: list[Term]
+    recordings: Sequence[Recording],
+    blocks: list[np.ndarray],
+    base: list[tuple[Term, float]],
+    terms: list[Term],
+    curves: list[Term],
+    periodic: list[Term],
+    nulls_count: int,
+    seed: int,
 ) -> tuple[Layout, list[Sums]]:
-    """Whiten every column of every recording and sum."""
+    """Say which columns belong to which hypothesis, and sum every recording."""
     layout = Layout({}, {"base": [], "library": [], "curves": []})
     place = 1
-    for kind, members in (("base", base), ("library", [(t, 0.0) for t in terms]), ("curves", [(c, 0.0) for c in curves])):
-        for term, sd in members:
-            columns = tuple(range(place, place + len(term.amplitudes)))
-            place += len(columns)
-            layout.groups[kind].append(Group(term.key, columns, term.per_session, sd, term.bounds))
-            layout.terms[columns[0]] = term
-    everything = [term for term, _ in base] + terms + curves
+    members = [("base", term, (sd,)) for term, sd in base]
+    members += [("library", term, _widest(term)) for term in terms]
+    members += [("curves", term, _widest(term)) for term in curves]
+    members += [("library", term, _widest(term)) for term in periodic]
+    for kind, term, sds in members:
+        columns = tuple(range(place, place + len(term.amplitudes)))
+        place += len(columns)
+        layout.groups[kind].append(Group(term.key, columns, term.scope, sds, term.bounds))
+        layout.terms[columns[0]] = term
+    prior_sds = np.concatenate([np.asarray(sds) for _, _, sds in members])
     sums = []
-    for recording in recordings:
-        sums.append(_whitened_sums(recording, _columns(recording, everything)))
+    for number, (recording, block) in enumerate(zip(recordings, blocks, strict=True)):
+        random = np.random.default_rng([seed, number])
+        sums.append(_whitened_sums(recording, block, prior_sds, nulls_count, random))
     return layout, sums
 
 
 def _periodic_terms(
-    recordings: list[Recording], base: list[tuple[Term, float]], terms: list[Term], curves: list[Term]
+    recordings: list[Recording],
+    blocks: list[np.ndarray],
+    base: list[tuple[Term, float]],
+    terms: list[Term],
+    curves: list[Term],
 ) -> list[Term]:
     """Make terms of pitches and frequencies that stand out of what all other hypotheses leave."""
     signals: dict[str, list[np.ndarray]] = {axis: [] for axis in recordings[0].axes}
-    for recording in recordings:
-        z = _columns(recording, [term for term, _ in base] + terms + curves)
+    for recording, z in zip(recordings, blocks, strict=True):
+        sds = np.concatenate([[sd for _, sd in base], *(_widest(term) for term in terms + curves)])
         start = 0
         for axis in recording.axes:
             size = int(recording.judged[axis].sum())
-            signals[axis].append(seeds.force_signal(recording, axis, _rest(z[start : start + size])))
+            signals[axis].append(seeds.force_signal(recording, axis, _rest(z[start : start + size], sds)))
             start += size
     found = []
     for axis, of_axis in signals.items():
@@ -202,33 +225,53 @@ def _columns(recording: Recording, terms: Sequence[Term]) -> np.ndarray:
     return np.column_stack(columns)
 
 
-def _whitened_sums(recording: Recording, z: np.ndarray) -> Sums:
+def _widest(term: Term) -> tuple[float, ...]:
+    """Return how large each amplitude can be at all: the far end of what its effect is declared for."""
+    if not term.bounds:
+        return (np.inf,) * len(term.amplitudes)
+    return tuple(max(abs(low), abs(high)) for low, high in term.bounds)
+
+
+def _whitened_sums(
+    recording: Recording, z: np.ndarray, prior_sds: np.ndarray, nulls_count: int, random: np.random.Generator
+) -> Sums:
     """Take what correlation is left out of one recording, by what no hypothesis explains, and sum."""
     start = 0
     gram = np.zeros((z.shape[1], z.shape[1]))
+    nulls = np.zeros((nulls_count, z.shape[1] - 1))
     count = 0.0
     for axis in recording.axes:
         size = int(recording.judged[axis].sum())
         block = z[start : start + size]
         start += size
-        rest = _rest(block)
+        rest = _rest(block, prior_sds)
         coefficients, sd = _autoregression(rest)
         block = lfilter(np.concatenate([[1.0], -coefficients]), [1.0], block, axis=0)[_AR_ORDER:] / sd
         gram += block.T @ block
+        nulls += random.standard_normal((nulls_count, block.shape[0])) @ block[:, 1:]
         count += block.shape[0]
-    return Sums(gram, count, recording.log.session)
+    return Sums(gram, count, recording.log.session, recording.log.name, nulls)
 
 
-def _rest(block: np.ndarray) -> np.ndarray:
-    """Return the innovations without everything that any hypothesis explains: what is left is noise, if anything is."""
+def _rest(block: np.ndarray, prior_sds: np.ndarray) -> np.ndarray:
+    """Return the innovations without everything that any hypothesis explains: what is left is noise, if anything is.
+
+    Amplitudes keep to their priors: free, a scale error of the sensor and one of the forces explain any motion whole.
+    """
     columns = block[:, 1:]
     scale = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     used = scale > 0.0
-    normalised = columns[:, used] / scale[used]
-    values, vectors = np.linalg.eigh(normalised.T @ normalised)
-    kept = values > 1e-7 * values[-1]
-    basis = normalised @ (vectors[:, kept] / np.sqrt(values[kept]))
-    return block[:, 0] - basis @ (basis.T @ block[:, 0])
+    columns, scale = columns[:, used] / scale[used], scale[used]
+    normal = columns.T @ columns
+    right = columns.T @ block[:, 0]
+    variance = 1.0
+    rest = block[:, 0]
+    for _ in range(_REST_PASSES):
+        precision = variance / (scale * prior_sds[used]) ** 2 + 1e-9
+        theta = np.linalg.solve(normal + np.diag(precision), right)
+        rest = block[:, 0] - columns @ theta
+        variance = float(np.mean(rest * rest))
+    return rest
 
 
 def _autoregression(rest: np.ndarray) -> tuple[np.ndarray, float]:
