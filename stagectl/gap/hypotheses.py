@@ -202,12 +202,16 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
     bounds = (
         tuple((-effect.bounds[name.removesuffix("*")][1], effect.bounds[name.removesuffix("*")][1]) for name in amplitudes)
         if any(name.endswith("*") for name in amplitudes)
-        else tuple(effect.bounds[name] for name in linear) or _SHARE_BOUNDS.get(effect.name, ((0.0, 1e3),))
+        else tuple(effect.bounds[name] for name in linear) or (_share_bounds(effect, shape),)
     )
     return Term(effect.name, place, dict(shape), tuple(amplitudes), forces, scope, bounds)
 
 
-_SHARE_BOUNDS: dict[str, tuple[tuple[float, float], ...]] = {"sensor_delay": ((-1e3, 1e3),)}
+def _share_bounds(effect: Effect, shape: dict[str, float]) -> tuple[float, float]:
+    """Return what the amplitude of an effect that is linear in nothing may be: its parameter's range over its shape."""
+    name = effect.parameters[0]
+    low, high = effect.bounds[name]
+    return (0.0 if low > 0.0 else low / shape[name]), high / shape[name]
 
 
 def _phase_of(effect: Effect, amplitude: str) -> str | None:

@@ -44,6 +44,12 @@ class Group:
     scope: str = "structural"  # structural | session | run: how far its amplitudes reach
     prior_sds: tuple[float, ...] = ()
     bounds: tuple[tuple[float, float], ...] = ()  # of each amplitude; a friction that drives is no friction
+    searched: int = 0  # shape parameters that a grid or a spectrum chose
+
+    @property
+    def complexity(self) -> int:
+        """Numbers that it takes from the data."""
+        return len(self.columns) + self.searched
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,13 +188,13 @@ class Judge:
             ranked = []
             taken = {group.key for group in chosen}
             for group in self.library:
-                if group.key in taken or not within_bounds(solve([*self.base, *chosen, group], self.training)):
+                if group.key in taken or not self._allowed([*chosen, group]):
                     continue
                 gains = self.gains([*chosen, group])
                 ranked.append((gains[0] - now[0], gains[1] - now[1], group))
             passing = [row for row in ranked if self._stays(row[0], row[1], left) and self._agrees(chosen, row[2])]
             price = self._price()
-            best = max(passing, key=lambda row: row[0] + row[1] - price * len(row[2].columns), default=None)
+            best = max(passing, key=lambda row: row[0] + row[1] - price * row[2].complexity, default=None)
             top = sorted(ranked, key=lambda row: -(row[0] + row[1]))[:4]
             self.trace.append(
                 f"left {left[0]:.0f} / {left[1]:.0f}: "
@@ -207,19 +213,21 @@ class Judge:
     def _worth(self, groups: Sequence[Group]) -> float:
         """Return gains on both kinds of recordings, less the price of the amplitudes."""
         trained, apart = self.gains(groups)
-        return trained + apart - self._price() * sum(len(group.columns) for group in groups)
+        return trained + apart - self._price() * sum(group.complexity for group in groups)
 
     def _allowed(self, groups: Sequence[Group]) -> bool:
-        return within_bounds(solve([*self.base, *groups], self.training))
+        """Tell whether every amplitude is one that its effect can have, on the training recordings and on all."""
+        everything = [*self.training, *self.held]
+        return all(within_bounds(solve([*self.base, *groups], part)) for part in (self.training, everything))
 
     def _swapped(self, chosen: list[Group]) -> list[Group]:
-        """Exchange single terms as long as that is worth more: what came first need not be what is true."""
+        """Exchange single terms for no less simple ones as long as that is worth more: the first need not be the true."""
         for _ in range(2 * len(chosen)):
             now, best, better = self._worth(chosen), chosen, 0.0
             for k, group in enumerate(chosen):
                 taken = {other.key for other in chosen if other is not group}
                 for other in self.library:
-                    if other is group or other.key in taken:
+                    if other is group or other.key in taken or other.complexity > group.complexity:
                         continue
                     instead = [*chosen[:k], other, *chosen[k + 1 :]]
                     gain = self._worth(instead) - now
@@ -235,8 +243,8 @@ class Judge:
         for k, group in enumerate(chosen):
             rest = [other for other in chosen if other is not group]
             now, without = sum(self.gains(chosen)), sum(self.gains(rest))
-            for other in sorted(self.library, key=lambda g: len(g.columns)):
-                if len(other.columns) >= len(group.columns) or other.key in {g.key for g in rest}:
+            for other in sorted(self.library, key=lambda g: g.complexity):
+                if other.complexity >= group.complexity or other.key in {g.key for g in rest}:
                     continue
                 instead = [*chosen[:k], other, *chosen[k + 1 :]]
                 if now - sum(self.gains(instead)) < max(ALIAS_GAIN, _ALIAS_SHARE * (now - without)):

@@ -4,7 +4,7 @@ Values in, values out; same input, same answer. Pure.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -176,12 +176,27 @@ def _sums(
         place += len(columns)
         layout.groups[kind].append(Group(term.key, columns, term.scope, sds, term.bounds))
         layout.terms[columns[0]] = term
+    for name, searched in _searched([*terms, *periodic]).items():
+        layout.groups["library"] = [
+            replace(group, searched=searched) if group.key == name else group for group in layout.groups["library"]
+        ]
     prior_sds = np.concatenate([np.asarray(sds) for _, _, sds in members])
     sums = []
     for number, (recording, block) in enumerate(zip(recordings, blocks, strict=True)):
         random = np.random.default_rng([seed, number])
         sums.append(_whitened_sums(recording, block, prior_sds, nulls_count, random))
     return layout, sums
+
+
+def _searched(terms: list[Term]) -> dict[object, int]:
+    """Count, by name, the shape parameters that differ between the hypotheses of one effect, periods always."""
+    found: dict[object, int] = {}
+    for key in {term.key for term in terms}:
+        shapes = [term.shape for term in terms if term.key == key]
+        found[key] = sum(
+            len({shape[name] for shape in shapes}) > 1 or name in ("pitch_m", "frequency_hz") for name in shapes[0]
+        )
+    return found
 
 
 def _periodic_terms(
