@@ -203,7 +203,6 @@ def forces_module(structure: tuple[tuple[str, str], ...]) -> ModuleType:
     return generated_module("forces", _forces_source(structure))
 
 
-@cache
 def along(known: Effect) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
     """Return a compiled function (columns, parameters, memory) that gives an effect's output row by row.
 

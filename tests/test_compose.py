@@ -11,6 +11,8 @@ import pytest
 from stagectl import compose
 from stagectl.compiled import CACHE_FOLDER
 from stagectl.errors import ProfileError
+from stagectl.plant import MEMORY_COUNT
+from tests.effect_numbers import table
 from tests.stage import Bench
 
 VISCOUS = {"name": "viscous_friction", "acts_on": "macro_force", "damping_n_s_per_m": 5.0}
@@ -67,12 +69,68 @@ def test_each_place_sums_its_own_effects():
     effects = [VISCOUS, CABLE, COGGING, REACTION, CONTACT, ERROR]
     forces = compose.forces_module(compose.structure_of(effects))
     p = compose.effect_parameters(effects)
-    motion = (0.006, 0.2, 1e-4, 0.01, 1.5, 30.0, 12.0, 7.0)  # in the order of QUANTITIES
-    assert forces.macro_force(*motion, p) == pytest.approx(-1.0 + 3.0 - 12.0, abs=1e-12)
-    assert forces.micro_force(*motion, p) == pytest.approx(-2.0 * (0.006 - 0.05), abs=1e-15)
-    assert forces.micro_actuator(*motion, p) == pytest.approx(-3.0, abs=1e-15)
-    assert forces.macro_actuator(*motion, p) == 0.0
-    assert forces.contact(1e-5, 0.01, p) == pytest.approx(0.75, abs=1e-15)
+    nothing = np.zeros(0)
+    motion = (0.006, 0.2, 0.5, 70.0, 1e-4, 0.01, 1.5, 30.0, 12.0, 7.0, 1e-4)  # in the order of QUANTITIES
+    assert forces.macro_force(*motion, nothing, p) == pytest.approx(-1.0 + 3.0 - 12.0, abs=1e-12)
+    assert forces.micro_force(*motion, nothing, p) == pytest.approx(-2.0 * (0.006 - 0.05), abs=1e-15)
+    assert forces.micro_actuator(*motion, nothing, p) == pytest.approx(-3.0, abs=1e-15)
+    assert forces.macro_actuator(*motion, nothing, p) == 0.0
+    assert forces.contact(1e-5, 0.01, 1e4, 1.0, 7.0, 1e-4, nothing, p) == pytest.approx(0.75, abs=1e-15)
+
+
+def test_the_other_places_sum_their_own_effects():
+    effects = [
+        table("linear_stiffness", "joint", stiffness_n_per_m=500.0),
+        table("backlash_width_change", change_m=4e-6),
+        table("backlash_centre_shift", shift_m=1e-6),
+        table("amplifier_dead_band", "micro_command", half_width_a=0.02),
+        table("scale_error", "macro_sensor", error_ppm=2.0),
+        table("scale_error", "end_sensor", error_ppm=-1.0),
+    ]
+    forces = compose.forces_module(compose.structure_of(effects))
+    p, nothing = compose.effect_parameters(effects), np.zeros(0)
+    assert forces.joint(2e-3, 0.0, 0.0, 0.0, nothing, p) == pytest.approx(-1.0, rel=1e-15)
+    assert forces.contact_edge(1.0, 0.0, nothing, p) == pytest.approx(3e-6, rel=1e-15)
+    assert forces.contact_edge(-1.0, 0.0, nothing, p) == pytest.approx(1e-6, rel=1e-15)
+    assert forces.micro_command(0.05, 0.0, 1e-4, nothing, p) == pytest.approx(-0.02, rel=1e-15)
+    assert forces.macro_command(0.05, 0.0, 1e-4, nothing, p) == 0.0
+    assert forces.macro_sensor(0.3, 0.0, 0.0, 0.0, 0.0, nothing, p) == pytest.approx(6e-7, rel=1e-15)
+    assert forces.end_sensor(0.3, 0.0, 0.0, 0.0, 0.0, nothing, p) == pytest.approx(-3e-7, rel=1e-15)
+
+
+def test_each_effect_has_a_memory_of_its_own():
+    """Two of a kind on one axis, a third with three numbers: nobody writes where another reads."""
+    effects = [
+        table("dahl_friction", "macro_force", slip_m=1e-6),
+        VISCOUS,
+        table("flexible_mode", "macro_force"),
+        table("dahl_friction", "macro_force", slip_m=1e-3),
+    ]
+    forces = compose.forces_module(compose.structure_of(effects))
+    p, memory = compose.effect_parameters(effects), np.zeros(8)
+    forces.macro_force(0.0, 1e-3, 0.5, 70.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e-3, memory, p)
+    assert memory[0] == pytest.approx(0.63212055882855768, rel=1e-15)  # 1 - 1/e
+    assert memory[3] == pytest.approx(0.1 / 0.9 * 0.5, rel=0.1)  # F / m of the mode, which hardly began to swing
+    assert memory[4] == pytest.approx(1e-3, rel=1e-3)  # of the second slip length a thousandth
+    assert np.all(memory[5:] == 0.0)
+
+
+def test_a_law_can_undo_what_acts_at_once():
+    effects = [table("command_delay", "macro_command"), table("amplifier_dead_band", "macro_command", half_width_a=0.1)]
+    forces = compose.forces_module(compose.structure_of(effects))
+    p, memory = compose.effect_parameters(effects), np.zeros(MEMORY_COUNT)
+    assert forces.macro_command(1.0, 0.0, 1e-4, memory, p) == pytest.approx(-1.1, rel=1e-12)
+    assert memory[1] == 1.0  # one change is on its way
+    before = memory.copy()
+    assert forces.macro_command_at_once(1.0, 0.0, 1e-4, memory, p) == pytest.approx(-0.1, rel=1e-15)
+    assert memory.tobytes() == before.tobytes()
+
+
+def test_more_memory_than_there_is():
+    delay = table("command_delay", "macro_command")
+    compose.structure_of([delay] * 3)
+    with pytest.raises(ProfileError, match="effects remember 72 numbers, and a machine has room for 64; remove some"):
+        compose.structure_of([delay] * 4)
 
 
 def test_an_actuator_effect_is_felt_by_mass_and_reaction_alike():
@@ -98,11 +156,12 @@ def test_a_damaged_module_in_the_cache_is_written_anew():
 
 def test_two_processes_compose_the_same_machine_at_once(tmp_path):
     text = (
-        "import sys; from stagectl import compose\n"
+        "import sys; import numpy as np; from stagectl import compose\n"
         "tables = [{'name': 'viscous_friction', 'acts_on': 'macro_force', 'damping_n_s_per_m': 5.0}]\n"
         "sys.stdin.readline()\n"
         "module = compose.forces_module(compose.structure_of(tables))\n"
-        "print(module.macro_force(0.0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, compose.effect_parameters(tables)))"
+        "motion = (0.0, 0.2, *[0.0] * 9)\n"
+        "print(module.macro_force(*motion, np.zeros(0), compose.effect_parameters(tables)))"
     )
     environment = os.environ | {"STAGECTL_CACHE": str(tmp_path)}
     children = [

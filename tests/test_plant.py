@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from stagectl import plant
 from stagectl.plant import BRIDGE_OFF, BRIDGE_SHORTED
+from tests.effect_numbers import table
 from tests.stage import HARD, Bench, place
 
 OFF = (BRIDGE_OFF, BRIDGE_OFF)
@@ -437,6 +438,141 @@ def test_a_belief_draws_no_noise():
     bench.advance(0.1)
     assert bench["macro_disturbance_n"] == 2.0  # an observer's own, felt as it stands
     assert bench["macro_velocity_m_per_s"] == pytest.approx(2.0 * 0.1 / 70.0, rel=1e-12)
+
+
+# ---- effects beside force and contact -------------------------------------------------------------------------
+
+
+def test_edges_of_the_gap_lie_where_effects_put_them():
+    """176 um + 10 / 2 + 3 right, 25.4 um + 10 / 2 - 3 left: 2 um beyond each there are 2 um x K."""
+    moved = [table("backlash_width_change", change_m=10e-6), table("backlash_centre_shift", shift_m=3e-6)]
+    for x_b_m, force_n in ((186e-6, 9.87e3 * 2e-6), (-29.4e-6, -13.2e3 * 2e-6), (183.9e-6, 0.0), (-27.3e-6, 0.0)):
+        bench = Bench(moved, JOINT | {"spring_n_per_m": 0.0})
+        place(bench.state, macro_position_m=x_b_m)
+        bench.advance(1e-9, bridges=OFF)
+        assert bench["contact_force_n"] == pytest.approx(force_n, rel=1e-6)
+
+
+def test_a_narrower_gap_has_contact_where_there_was_none():
+    bench = Bench([table("backlash_width_change", change_m=-10e-6)], JOINT | {"spring_n_per_m": 0.0})
+    place(bench.state, macro_position_m=173e-6)  # 3 um inside the old edge, 2 um beyond the new one
+    bench.advance(1e-9, bridges=OFF)
+    assert bench["contact_force_n"] == pytest.approx(9.87e3 * 2e-6, rel=1e-6)
+
+
+def test_wear_counts_from_the_start_of_the_run():
+    bench = Bench([table("backlash_wear", rate_m_per_s=1e-6)], JOINT | {"spring_n_per_m": 0.0})
+    bench.advance(10.0, bridges=OFF, longest_s=1e-3)
+    assert bench["right_edge_shift_m"] == pytest.approx(5e-6, rel=1e-3)
+    assert bench["left_edge_shift_m"] == bench["right_edge_shift_m"]
+
+
+def test_contact_effects_know_their_side_and_its_stiffness():
+    wrong = [table("contact_stiffness_error", left_error_ratio=0.1, right_error_ratio=-0.2)]
+    for x_b_m, force_n in ((276e-6, 0.8 * 0.987), (-125.4e-6, -1.1 * 1.32)):
+        bench = Bench(wrong, JOINT | {"spring_n_per_m": 0.0})
+        place(bench.state, macro_position_m=x_b_m)
+        bench.advance(1e-9, bridges=OFF)
+        assert bench["contact_force_n"] == pytest.approx(force_n, rel=1e-6)
+
+
+def test_a_joint_effect_is_felt_by_both():
+    bench = Bench([table("linear_stiffness", "joint", stiffness_n_per_m=2e3), table("cubic_stiffness", "joint")])
+    place(bench.state, end_position_m=1e-3)  # 2 N + 1e9 x 1e-9 = 1 N
+    bench.advance(1e-9, bridges=OFF)
+    assert 40.0 * bench["end_acceleration_m_per_s2"] == pytest.approx(-3.0, rel=1e-6)
+    for k in range(100):
+        bench.advance((k + 1) * 5e-3, bridges=OFF)
+        assert abs(momentum(bench)) < 1e-13
+
+
+def test_a_wrong_mass_answers_with_another_acceleration():
+    bench = Bench([table("mass_error", "macro_force", error_ratio=0.05)], {"has_micro": 0.0})
+    bench.advance(0.2, macro_a=7.0)
+    assert bench["macro_acceleration_m_per_s2"] == pytest.approx(70.0 / (70.0 * 1.05), rel=1e-12)
+    assert bench["macro_velocity_m_per_s"] == pytest.approx(0.2 / 1.05, rel=2e-3)
+
+
+def test_a_tilt_lets_both_slide_alike():
+    bench = Bench([table("gravity_tilt", axis, grade_ratio=-1e-3) for axis in ("macro_force", "micro_force")])
+    bench.advance(1.0)
+    assert bench["macro_velocity_m_per_s"] == pytest.approx(9.80665e-3, rel=1e-12)
+    assert bench["end_velocity_m_per_s"] == pytest.approx(9.80665e-3, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("share", "frequency_hz", "longest_s"), [(0.1, 60.0, 50e-6), (0.4, 200.0, 50e-6), (0.2, 80.0, 3e-4)]
+)
+def test_a_free_mode_rings_above_its_frequency_with_the_axis_held(share, frequency_hz, longest_s):
+    """f / sqrt(1 - mu), damped by zeta / sqrt(1 - mu); the whole mass is what it was."""
+    zeta = 0.02
+    mode = table("flexible_mode", "macro_force", share_ratio=share, frequency_hz=frequency_hz, damping_ratio=zeta)
+    bench = Bench([mode], {"has_micro": 0.0})
+    bench.advance(1e-3, macro_a=7.0, longest_s=longest_s)
+    t_s = 1e-3 + longest_s * np.arange(1, 4000)
+    velocity = np.array([bench.advance(t, longest_s=longest_s)["macro_velocity_m_per_s"] for t in t_s])
+    assert np.mean(velocity[-500:]) == pytest.approx(1e-3, rel=1e-2)  # 70 N x 1 ms / 70 kg
+    ring = velocity - 1e-3
+    free_hz = frequency_hz / math.sqrt(1.0 - share)
+    free_zeta = zeta / math.sqrt(1.0 - share)
+    crossings = np.flatnonzero((ring[20:-1] < 0.0) & (ring[21:] >= 0.0))[:6]
+    assert (len(crossings) - 1) / ((crossings[-1] - crossings[0]) * longest_s) == pytest.approx(free_hz, rel=0.02)
+    period = round(1.0 / free_hz / longest_s)
+    swings = [np.max(np.abs(ring[100 + k * period : 100 + (k + 1) * period])) for k in range(6)]
+    assert swings[5] / swings[0] == pytest.approx(math.exp(-10.0 * math.pi * free_zeta), rel=0.2)
+
+
+def test_a_late_command_is_felt_late():
+    bench = Bench([table("command_delay", "macro_command", delay_s=0.7e-3)], {"has_micro": 0.0})
+    bench.advance(0.69e-3, macro_a=7.0)
+    assert bench["macro_velocity_m_per_s"] == 0.0
+    bench.advance(0.1, macro_a=7.0)
+    # 1 m/s^2 from 0.7 ms on, less the current loop's 0.15 ms
+    assert bench["macro_velocity_m_per_s"] == pytest.approx(0.1 - 0.85e-3, rel=1e-9)
+
+
+def test_a_lagging_command_loses_its_time_constant():
+    bench = Bench([table("current_loop_lag", "macro_command", time_constant_s=0.4e-3)], {"has_micro": 0.0})
+    bench.advance(0.1, macro_a=7.0)
+    assert bench["macro_velocity_m_per_s"] == pytest.approx(0.1 - 0.55e-3, rel=1e-9)
+
+
+def test_pre_sliding_holds_what_coulomb_friction_lets_creep():
+    """3 N of 4 N: Dahl stands off by -delta ln(1 - 3/4), and stays; coulomb_friction's tanh creeps."""
+    damped = table("viscous_friction", damping_n_s_per_m=1e4)
+    bench = Bench([table("dahl_friction", "macro_force", slip_m=5e-6), damped], {"has_micro": 0.0})
+    for k in range(4000):
+        bench.advance((k + 1) * 1e-3, macro_a=0.3 * min(1.0, k / 2000.0))
+    assert bench["macro_position_m"] == pytest.approx(5e-6 * math.log(4.0), rel=0.02)
+    assert abs(bench["macro_velocity_m_per_s"]) < 1e-9
+
+
+def test_what_is_remembered_is_part_of_the_state():
+    """A copy of the state goes on as the original does."""
+    tables = [table("lugre_friction", "macro_force"), table("command_delay", "micro_command"), table("flexible_mode")]
+    bench = Bench(tables, JOINT)
+    bench.advance(0.05, macro_a=2.0, micro_a=0.4)
+    other = Bench(tables, JOINT)
+    other.state[...] = bench.state
+    for one in (bench, other):
+        one.advance(0.08, macro_a=-1.0, micro_a=0.1)
+    assert bench.state.tobytes() == other.state.tobytes()
+    assert np.any(bench.state["memory"] != 0.0)
+
+
+def test_sense_is_what_the_sensors_add():
+    tables = [
+        table("sensor_delay", "end_sensor", delay_s=1e-3),
+        table("sensor_lag", "macro_sensor", time_constant_s=1e-3),
+        table("scale_error", "macro_sensor", error_ppm=10.0),
+    ]
+    bench = Bench(tables)
+    place(bench.state, macro_velocity_m_per_s=0.1, end_velocity_m_per_s=0.2, macro_position_m=0.5)
+    call = (bench.state, bench.parameters, bench.effect_parameters)
+    first = bench.module.sense(*call, 1e-3)
+    assert first == pytest.approx((5e-6 - 1e-4 * (1.0 - math.exp(-1.0)), -2e-4), rel=1e-12)
+    assert bench.module.sense(*call, 0.0) == first  # no time, no change
+    assert bench.module.sense(*call, 1.0) == pytest.approx((5e-6 - 1e-4, -2e-4), rel=1e-12)
 
 
 # ---- from a machine file --------------------------------------------------------------------------------------

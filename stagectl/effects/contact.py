@@ -42,7 +42,7 @@ def contact_stiffness_error(
     places=("contact",),
     knee_m=(1e-8, 1e-3),
     symptom="contact force that sets in gently: less than linear by the same amount from a few micrometres on",
-    reference="Kang et al. 2023, section 6.1: a rounded knee; Johnson, Contact Mechanics, section 4.3, progressive contact",
+    reference="Kang et al. 2023, section 6.1: a rounded knee; Johnson, Contact Mechanics, section 4.3",
 )
 def soft_contact(penetration_m, contact_stiffness_n_per_m, knee_m):
     """Contact with a rounded knee: in all F = K p^2 / (2 delta) below delta, K (p - delta / 2) beyond."""

@@ -91,7 +91,7 @@ def stribeck_friction(velocity_m_per_s, excess_n, stribeck_m_per_s, smoothing_m_
 def sublinear_viscous_friction(velocity_m_per_s, level_n, exponent_ratio):
     """Viscous friction with a power p < 1: F = -F_1 |v / v_1|^p sgn v, v_1 = 0.1 m/s, linear below 0.1 mm/s."""
     speed = np.sqrt(velocity_m_per_s * velocity_m_per_s + _LEAST_SPEED_M_PER_S * _LEAST_SPEED_M_PER_S)
-    return -level_n * (speed / _NAMED_SPEED_M_PER_S) ** exponent_ratio * (velocity_m_per_s / speed)
+    return -level_n * np.power(speed / _NAMED_SPEED_M_PER_S, exponent_ratio) * (velocity_m_per_s / speed)
 
 
 @effect(

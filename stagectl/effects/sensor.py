@@ -1,4 +1,4 @@
-"""From the true position to the reading of an interferometer: what is added, in metres, at the instant of the sample."""
+"""From the true position to an interferometer's reading: what is added, in metres, at the instant of the sample."""
 
 import numpy as np
 
@@ -79,7 +79,7 @@ def cyclic_error(position_m, first_m, second_m, wavelength_m, first_phase_rad, s
 )
 def thermal_drift(t_s, drift_m, time_constant_s):
     """Drift of a part that warms up: D (1 - exp(-t / tau)), t since the start of the run."""
-    return drift_m * (1.0 - np.exp(-t_s / time_constant_s))
+    return -drift_m * np.expm1(-t_s / time_constant_s)
 
 
 @effect(

@@ -95,7 +95,7 @@ def cubic_stiffness(position_m, stiffness_n_per_m3):
     smoothing_m_per_s=(1e-7, 1e-1),
     linear=("slope_n_per_m",),
     symptom="a step at each reversal that grows along the way",
-    reference="Armstrong-Helouvry, Control of Machines with Friction, 1991, chapter 4: friction as a function of position",
+    reference="Armstrong-Helouvry, Control of Machines with Friction, 1991, chapter 4: friction along the way",
 )
 def position_dependent_friction(position_m, velocity_m_per_s, slope_n_per_m, smoothing_m_per_s):
     """Dry friction that changes along the way: F = -k x tanh(v / v_s), beside a Coulomb friction that it adds to."""
