@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stagectl import compose
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap import innovations
 from stagectl.gap.believed import Believed, BelievedAxis
-from stagectl.gap.evaluation import evaluated
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
 from stagectl.gap.motion import PARTS_COUNT, Motion, delayed, lagged, motion_of
@@ -249,7 +249,7 @@ def effect_forces(recording: Recording, effect: Effect, place: str, parameters: 
     """Evaluate one effect along the measured motion, and put it where it acts."""
     axis = "macro" if place.startswith("macro") else "end"
     known = quantities(recording, axis, place)
-    value = evaluated(effect, [known[name] for name in effect.quantities], parameters)
+    value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
     if place in ("contact", "contact_edge", "joint"):
         if place == "joint":
             push_n = value
@@ -281,3 +281,11 @@ def _misread(recording: Recording, axis: str, error_m: np.ndarray) -> Forces:
         forces.end_n = stiffness * error_m * (1.0 if axis == "end" else -1.0)
         forces.macro_n = -forces.end_n
     return forces
+
+
+def along_motion(effect: Effect, arguments: list[np.ndarray], parameters: list[float]) -> np.ndarray:
+    """Run a law in time order over arrays of its quantities, all of shape (n, parts); shape kept."""
+    columns = np.column_stack([np.ascontiguousarray(values).ravel() for values in arguments])
+    memory = np.zeros(max(effect.memory, 1))
+    out = compose.along(effect)(columns, np.array([*parameters, 0.0]), memory)
+    return np.asarray(out).reshape(arguments[0].shape)

@@ -45,6 +45,7 @@ class Log:
     reference_m: np.ndarray | None = None
     macro_reported_n: np.ndarray | None = None
     micro_reported_n: np.ndarray | None = None
+    command_extra_n: np.ndarray | None = None  # known, added to the macro's command behind its controller
     remarks: tuple[str, ...] = field(default=())
 
     @property
