@@ -19,7 +19,7 @@ BAND_HZ = 80.0
 """Commands are compared below it: above, quantised positions times the velocity gain are all there is."""
 
 _LEAST_LAP = 200  # samples
-_LAP_REACH = 3
+_LAP_REACH = 100
 _SAME_RATIO = 1e-3
 _FREE = 1e9  # of limits that an observed machine has none of
 _CIRCUIT = {"resistance_ohm": 1.0, "inductance_h": 1e-3, "supply_v": _FREE, "current_limit_a": _FREE}

@@ -26,6 +26,7 @@ class Term:
     forces: Callable[[Recording], list[Forces]]
     scope: str = "structural"
     bounds: tuple[tuple[float, float], ...] = ()
+    linear: bool = True
 
     @property
     def key(self) -> tuple[str, str]:
@@ -60,10 +61,14 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
     def known(name: str, sd: float, forces: Callable[[Recording], Forces]) -> None:
         found.append((Term(name, "parameter", {}, ("error_ratio",), lambda r: [forces(r)]), sd))
 
+    # a = f / m: a mass that is wrong by a ratio scales what is known to act. Taken as m times the measured acceleration
+    # it would, together with the force constant, shrink every rest that nobody explains: a fit that collapses.
     def inertia(axis: str) -> Callable[[Recording], Forces]:
         def of(r: Recording) -> Forces:
-            force_n = -r.mass_kg(axis) * r.motion(axis).acceleration_m_per_s2
-            return Forces(macro_n=force_n) if axis == "macro" else Forces(end_n=force_n)
+            known = balance.known_forces(r)
+            if axis == "macro":
+                return Forces(macro_n=None if known.macro_n is None else -known.macro_n)
+            return Forces(end_n=None if known.end_n is None else -known.end_n)
 
         return of
 
@@ -178,7 +183,7 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
     settings: list[dict[str, float]] = []
     amplitudes: list[str] = []
     for name in linear:
-        phase = _phase_of(effect, name)
+        phase = phase_of(effect, name)
         for angle in (0.0, 0.5 * np.pi) if phase else (None,):
             others = {p: 0.0 for p in effect.parameters if p.endswith("phase_rad")}
             values = others | dict.fromkeys(linear, 0.0) | {name: 1.0} | shape
@@ -204,7 +209,7 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
         if any(name.endswith("*") for name in amplitudes)
         else tuple(effect.bounds[name] for name in linear) or (_share_bounds(effect, shape),)
     )
-    return Term(effect.name, place, dict(shape), tuple(amplitudes), forces, scope, bounds)
+    return Term(effect.name, place, dict(shape), tuple(amplitudes), forces, scope, bounds, bool(linear))
 
 
 def _share_bounds(effect: Effect, shape: dict[str, float]) -> tuple[float, float]:
@@ -214,7 +219,7 @@ def _share_bounds(effect: Effect, shape: dict[str, float]) -> tuple[float, float
     return (0.0 if low > 0.0 else low / shape[name]), high / shape[name]
 
 
-def _phase_of(effect: Effect, amplitude: str) -> str | None:
+def phase_of(effect: Effect, amplitude: str) -> str | None:
     """Return the parameter that is the phase of an amplitude."""
     for name in (f"{amplitude.split('_')[0]}_phase_rad", "phase_rad"):
         if name in effect.parameters:

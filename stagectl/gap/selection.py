@@ -264,10 +264,10 @@ class Judge:
 
     def _stays(self, trained: float, apart: float, left: tuple[float, float]) -> bool:
         """Tell whether gains are beyond noise, and material beside what is left, on whichever side more is left."""
-        counts = [sum(s.count for s in part) for part in (self.training, self.held or self.training)]
-        share = MATERIAL_RATIO * max(left[0] / counts[0], left[1] / counts[1])
-        return trained > max(self.thresholds[0], share * counts[0]) and apart > max(
-            self.thresholds[1], share * counts[1]
+        before = self.reducible([])
+        share = MATERIAL_RATIO * max(now / first if first > 0.0 else 0.0 for now, first in zip(left, before, strict=True))
+        return trained > max(self.thresholds[0], share * before[0]) and apart > max(
+            self.thresholds[1], share * before[1]
         )
 
     def _without_superfluous(self, chosen: list[Group]) -> list[Group]:

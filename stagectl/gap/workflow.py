@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
+from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
 from stagectl.gap import balance, hypotheses, seeds
 from stagectl.gap.balance import Recording
@@ -65,6 +66,7 @@ class Findings:
     verdict: str  # nothing | found | unknown
     named: tuple[Named, ...]
     parameter_errors: tuple[ParameterError, ...]
+    refitted: dict[str, float]  # every known parameter's error as fitted: a ratio, or metres for an edge
     not_excited: tuple[str, ...]
     unknown: dict[str, Any] | None
     reducible_before: tuple[float, float]
@@ -129,6 +131,9 @@ def find(
         verdict=verdict,
         named=named,
         parameter_errors=_parameter_errors(base, judge.base, solution),
+        refitted={
+            term.name: float(solution.of(group)[0][0]) for (term, _), group in zip(base, judge.base, strict=True)
+        },
         not_excited=tuple(sorted(f"{name} on {place}" for name, place in by_key if (name, place) not in excited)),
         unknown=unknown,
         reducible_before=before,
@@ -308,11 +313,11 @@ def _named(judge: Judge, chosen: list[Group], group: Group, solution: Solution, 
     values, sds = solution.of(group)
     rest = judge.gains([other for other in chosen if other is not group])
     whole = judge.gains(chosen)
-    parameters, errors = _readable(term, values, sds)
+    parameters, errors = _readable(term, values, sds, _places(term, solution, group))
     return Named(
         name=term.name,
         acts_on=term.acts_on,
-        parameters=parameters | term.shape,
+        parameters=parameters if not term.linear else term.shape | parameters,
         sds=errors,
         gain=whole[0] - rest[0],
         held_out_gain=whole[1] - rest[1],
@@ -320,20 +325,32 @@ def _named(judge: Judge, chosen: list[Group], group: Group, solution: Solution, 
     )
 
 
-def _readable(term: Term, values: np.ndarray, sds: np.ndarray) -> tuple[dict[str, float], dict[str, float]]:
-    """Turn pairs of a sine and a cosine into amplitude and phase, session by session."""
+def _places(term: Term, solution: Solution, group: Group) -> list[str]:
+    """Name the sessions or runs that the values of a group belong to, in their order; one empty name where to none."""
+    return [scope for column, scope in solution.slots if column == group.columns[0]]
+
+
+def _readable(
+    term: Term, values: np.ndarray, sds: np.ndarray, places: list[str]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Turn pairs of a sine and a cosine into amplitude and phase, session by session, and a share into its value."""
     parameters: dict[str, float] = {}
     errors: dict[str, float] = {}
     per = len(term.amplitudes)
-    for number in range(values.size // per):
-        mark = f" of session {number + 1}" if values.size > per else ""
+    if not term.linear:
+        (first, value), *rest = term.shape.items()
+        return {first: float(values[0]) * value, **dict(rest)}, {first: float(sds[0]) * abs(value)}
+    for number, place in enumerate(places):
+        mark = f" of {place}" if place else ""
         here, sd = values[number * per : (number + 1) * per], sds[number * per : (number + 1) * per]
         if all(name.endswith("*") for name in term.amplitudes):
-            sine, cosine = here[0], here[1]
-            name = term.amplitudes[0].removesuffix("*")
-            parameters[name + mark] = float(np.hypot(sine, cosine))
-            parameters["phase_rad" + mark] = float(np.arctan2(cosine, sine))
-            errors[name + mark] = float(np.mean(sd))
+            effect = CATALOGUE[term.name]
+            for pair in range(0, per, 2):
+                name = term.amplitudes[pair].removesuffix("*")
+                phase = hypotheses.phase_of(effect, name)
+                parameters[name + mark] = float(np.hypot(here[pair], here[pair + 1]))
+                parameters[f"{phase}{mark}"] = float(np.arctan2(here[pair + 1], here[pair]))
+                errors[name + mark] = float(np.mean(sd[pair : pair + 2]))
         else:
             for name, value, one in zip(term.amplitudes, here, sd, strict=True):
                 parameters[name + mark] = float(value)
