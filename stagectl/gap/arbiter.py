@@ -102,7 +102,7 @@ def simulate(believed: Believed, effects: list[dict[str, Any]], log: Log, mass_r
     extra = np.zeros(log.samples_count) if log.command_extra_n is None else log.command_extra_n
     module.follow(
         log.reference_m, extra, state, parameters, compose.effect_parameters(effects), log.period_s,
-        max(log.latch_s, 0.0), 0.25 * log.period_s, cascade.position_gain_per_s, cascade.velocity_gain_n_s_per_m,
+        max(believed.macro.latch_s, 0.0), 0.25 * log.period_s, cascade.position_gain_per_s, cascade.velocity_gain_n_s_per_m,
         cascade.limit_n, believed.macro.force_constant_n_per_a, positions, commands,
     )  # fmt: skip
     return Closed(positions, commands)

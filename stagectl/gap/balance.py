@@ -48,6 +48,7 @@ class Recording:
     side: np.ndarray | None
     filters: dict[str, tuple[Noise, np.ndarray, np.ndarray]]
     judged: dict[str, np.ndarray]
+    known: dict[tuple[str, str], dict[str, np.ndarray]]  # quantities by axis and kind of place, once they were asked for
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -75,8 +76,9 @@ class Recording:
         return self.believed.micro
 
     def mass_kg(self, axis: str) -> float:
-        """Believed mass of one body."""
-        return self.belief(axis).mass_kg
+        """Believed mass of one body with what it carries."""
+        payload_kg = self.log.macro_payload_kg if axis == "macro" else self.log.end_payload_kg
+        return self.belief(axis).mass_kg + payload_kg
 
     def force_constant_n_per_a(self, axis: str) -> float:
         """Believed force constant of one motor."""
@@ -87,18 +89,18 @@ class Recording:
         command_n = self.log.macro_command_n if axis == "macro" else self.log.micro_command_n
         if command_n is None:
             return np.zeros_like(self.macro.position_m)
-        return delayed(command_n, self.log.latch_s / self.log.period_s)
+        return delayed(command_n, self.belief(axis).latch_s / self.log.period_s)
 
 
 def recording_of(log: Log, believed: Believed) -> Recording:
     """Prepare a log: motion, commands on parts of intervals, contact geometry."""
     h = log.period_s
     macro = motion_of(log.macro_position_m, h, believed.macro.noise_m)
-    macro_n = lagged(delayed(log.macro_command_n, log.latch_s / h), believed.macro.current_loop_s, h)
+    macro_n = lagged(delayed(log.macro_command_n, believed.macro.latch_s / h), believed.macro.current_loop_s, h)
     end = micro_n = depth = depth_rate = side = None
     if log.end_position_m is not None and log.micro_command_n is not None and believed.micro is not None:
         end = motion_of(log.end_position_m, h, believed.micro.noise_m)
-        micro_n = lagged(delayed(log.micro_command_n, log.latch_s / h), believed.micro.current_loop_s, h)
+        micro_n = lagged(delayed(log.micro_command_n, believed.micro.latch_s / h), believed.micro.current_loop_s, h)
         joint = believed.joint
         if joint is not None:
             x_b = macro.position_m - end.position_m
@@ -106,7 +108,7 @@ def recording_of(log: Log, believed: Believed) -> Recording:
             side = np.where(x_b > joint.right_m, 1.0, np.where(x_b < -joint.left_m, -1.0, 0.0))
             depth = np.where(side > 0.0, x_b - joint.right_m, np.where(side < 0.0, -joint.left_m - x_b, 0.0))
             depth_rate = side * rate
-    return Recording(log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {})
+    return Recording(log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {})
 
 
 def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = True) -> None:
@@ -197,6 +199,14 @@ def add(total: Forces, more: Forces) -> None:
 
 def quantities(recording: Recording, axis: str, place: str) -> dict[str, np.ndarray]:
     """Everything that a law at one place may ask for, on parts of intervals."""
+    kind = "joint" if place == "joint" else "sensor" if place.endswith("_sensor") else "force"
+    key = (axis, kind)
+    if key not in recording.known:
+        recording.known[key] = _quantities(recording, axis, kind)
+    return recording.known[key]
+
+
+def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndarray]:
     motion = recording.motion(axis)
     h = recording.log.period_s
     whole = np.ones_like(motion.position_m)
@@ -205,10 +215,9 @@ def quantities(recording: Recording, axis: str, place: str) -> dict[str, np.ndar
     relative_m_per_s = relative.velocity_m_per_s - recording.macro.velocity_m_per_s
     motor_n = recording.macro_command_n if axis == "macro" else recording.micro_command_n
     motor_n = 0.0 * whole if motor_n is None else motor_n
-    at_sample = place.endswith("_sensor")
     known = {
-        "position_m": relative_m if place == "joint" else motion.position_m,
-        "velocity_m_per_s": relative_m_per_s if place == "joint" else motion.velocity_m_per_s,
+        "position_m": relative_m if kind == "joint" else motion.position_m,
+        "velocity_m_per_s": relative_m_per_s if kind == "joint" else motion.velocity_m_per_s,
         "acceleration_m_per_s2": motion.acceleration_m_per_s2,
         "relative_position_m": relative_m,
         "relative_velocity_m_per_s": relative_m_per_s,
@@ -220,7 +229,7 @@ def quantities(recording: Recording, axis: str, place: str) -> dict[str, np.ndar
         "t_s": recording.log.times_s[:, None] + (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * h,
         "dt_s": h / PARTS_COUNT * whole,
     }
-    if at_sample:  # a reading is of the sample's instant, which begins its interval
+    if kind == "sensor":  # a reading is of the sample's instant, which begins its interval
         position_m = recording.position_m(axis)[:, None] * whole
         velocity = np.gradient(motion.position_m.mean(axis=1), h)
         known |= {"position_m": position_m, "velocity_m_per_s": _at_samples(motion.velocity_m_per_s, velocity)}

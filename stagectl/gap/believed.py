@@ -20,6 +20,8 @@ FORCE_CONSTANT_SD_RATIO = 0.01
 STIFFNESS_SD_RATIO = 0.02
 DAMPING_SD_RATIO = 0.20
 EFFECT_SD_RATIO = 0.20
+LATCH_SD_S = 20e-6
+CURRENT_LOOP_SD_S = 20e-6
 """Where a profile states no standard deviation."""
 
 
@@ -42,6 +44,9 @@ class BelievedAxis:
     current_loop_s: float
     force_constant_n_per_a: float = 1.0
     force_constant_sd_ratio: float = FORCE_CONSTANT_SD_RATIO
+    latch_s: float = 0.0  # sample instant -> the drive takes over the command of the same row
+    latch_sd_s: float = LATCH_SD_S
+    current_loop_sd_s: float = CURRENT_LOOP_SD_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +62,8 @@ class BelievedJoint:
     width_sd_m: float
     stiffness_sd_ratio: float = STIFFNESS_SD_RATIO
     damping_sd_ratio: float = DAMPING_SD_RATIO
+    left_stiffness_sd_ratio: float = STIFFNESS_SD_RATIO
+    right_stiffness_sd_ratio: float = STIFFNESS_SD_RATIO
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +72,13 @@ class Believed:
 
     name: str
     period_s: float
-    latch_s: float
     macro: BelievedAxis
     micro: BelievedAxis | None = None
     joint: BelievedJoint | None = None
     effects: tuple[dict[str, Any], ...] = ()
     cascade: Cascade | None = None
     effect_sd_ratio: float = EFFECT_SD_RATIO
+    effect_sd_ratios: dict[str, float] = field(default_factory=dict)  # by effect, where it is stated
     travel_m: float = 1.0
     source: dict[str, Any] = field(default_factory=dict)
 
@@ -145,8 +152,9 @@ def believed_of_observed(machine: ObservedMachine) -> Believed:
     return Believed(
         name=machine.name,
         period_s=1.0 / machine.cycle.rate_hz,
-        latch_s=machine.cycle.latch_s,
-        macro=BelievedAxis(body.mass_kg, body.mass_sd_kg, machine.sensor.noise_m, body.current_loop_s),
+        macro=BelievedAxis(
+            body.mass_kg, body.mass_sd_kg, machine.sensor.noise_m, body.current_loop_s, latch_s=machine.cycle.latch_s
+        ),
         effects=tuple(dict(row) for row in machine.effects),
         cascade=cascade,
         effect_sd_ratio=machine.effect_sd_ratio,
@@ -163,6 +171,7 @@ def believed_of_profile(profile: Profile) -> Believed:
         noise_m,
         profile.macro.current_loop_s,
         profile.macro.rated_force_n / profile.macro.rated_current_a,
+        latch_s=profile.cycle.actuation_delay_s,
     )
     micro = joint = None
     if profile.micro is not None and profile.backlash is not None:
@@ -172,6 +181,7 @@ def believed_of_profile(profile: Profile) -> Believed:
             noise_m,
             profile.micro.current_loop_s,
             profile.micro.rated_force_n / profile.micro.rated_current_a,
+            latch_s=profile.cycle.actuation_delay_s,
         )
         backlash = profile.backlash
         joint = BelievedJoint(
@@ -186,7 +196,6 @@ def believed_of_profile(profile: Profile) -> Believed:
     return Believed(
         name=profile.name,
         period_s=1.0 / profile.cycle.rate_hz,
-        latch_s=profile.cycle.actuation_delay_s,
         macro=macro,
         micro=micro,
         joint=joint,

@@ -12,6 +12,7 @@ import numpy as np
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap import balance
 from stagectl.gap.balance import Forces, Recording
+from stagectl.gap.motion import delayed, lagged
 
 
 
@@ -95,10 +96,16 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
             def edge(r: Recording, sign: float = sign, stiffness: float = stiffness) -> np.ndarray:
                 return np.where(r.side == sign, -sign * stiffness, 0.0)
 
-            known(f"{side}_stiffness_n_per_m", joint.stiffness_sd_ratio, _joint(push))
+            known(f"{side}_stiffness_n_per_m", getattr(joint, f"{side}_stiffness_sd_ratio"), _joint(push))
             found.append(
                 (Term(f"{side}_m", "parameter", {}, ("error_m",), _as_list(_joint(edge))), joint.width_sd_m)
             )
+    for axis, side in (("macro", "macro"), ("end", "micro")):
+        if axis in recording.axes:
+            belief = recording.belief(axis)
+            found.append((_timing(f"{side}_latch_s", axis, 0.0), belief.latch_sd_s))
+            if belief.current_loop_s > 0.0:
+                found.append((_timing(f"{side}_current_loop_s", axis, belief.current_loop_s), belief.current_loop_sd_s))
     for row in believed.effects:
         effect = CATALOGUE[row["name"]]
         values = [row[name] for name in effect.parameters]
@@ -106,8 +113,35 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
         def existing(r: Recording, effect: Effect = effect, place: str = row["acts_on"], values: list = values) -> Forces:
             return balance.effect_forces(r, effect, place, values)
 
-        known(f"{row['name']} on {row['acts_on']}", believed.effect_sd_ratio, existing)
+        name = f"{row['name']} on {row['acts_on']}"
+        known(name, believed.effect_sd_ratios.get(name, believed.effect_sd_ratio), existing)
     return found
+
+
+_TIMING_STEP_S = 5e-6
+
+
+def _timing(name: str, axis: str, lag_s: float) -> Term:
+    """Return the error of a delay (`lag_s` = 0) or of a lag, in seconds, by a difference over a small step."""
+
+    def forces(r: Recording) -> list[Forces]:
+        h, belief = r.log.period_s, r.belief(axis)
+        command_n = r.log.macro_command_n if axis == "macro" else r.log.micro_command_n
+        if command_n is None:
+            return [Forces()]
+        step_s = _TIMING_STEP_S
+        now = lagged(delayed(command_n, belief.latch_s / h), belief.current_loop_s, h)
+        if lag_s:
+            later = lagged(delayed(command_n, belief.latch_s / h), belief.current_loop_s + step_s, h)
+        else:
+            later = lagged(delayed(command_n, (belief.latch_s + step_s) / h), belief.current_loop_s, h)
+        slope = (later - now) / step_s
+        if axis == "macro":
+            return [Forces(macro_n=slope)]
+        reaction = sum(row["fraction_ratio"] for row in r.believed.effects if row["name"] == "micro_reaction")
+        return [Forces(macro_n=-reaction * slope if reaction else None, end_n=slope)]
+
+    return Term(name, "parameter", {}, ("error_s",), forces)
 
 
 def _as_list(forces: Callable[[Recording], Forces]) -> Callable[[Recording], list[Forces]]:

@@ -29,8 +29,7 @@ _MILLIMETRES_SPAN = 2.0
 class Log:
     """Values of one recording, one element a sample of the position sensor.
 
-    `valid` is False where a sample is missing or its cycle is unusable: such samples are predicted over. `latch_s` is
-    the instant, after the sample's own, at which the drives take over the command of the same row.
+    `valid` is False where a sample is missing or its cycle is unusable: such samples are predicted over.
     """
 
     name: str
@@ -38,7 +37,6 @@ class Log:
     macro_position_m: np.ndarray
     macro_command_n: np.ndarray
     valid: np.ndarray
-    latch_s: float
     session: str
     end_position_m: np.ndarray | None = None
     micro_command_n: np.ndarray | None = None
@@ -46,6 +44,8 @@ class Log:
     macro_reported_n: np.ndarray | None = None
     micro_reported_n: np.ndarray | None = None
     command_extra_n: np.ndarray | None = None  # known, added to the macro's command behind its controller
+    macro_payload_kg: float = 0.0
+    end_payload_kg: float = 0.0
     remarks: tuple[str, ...] = field(default=())
 
     @property
@@ -64,7 +64,7 @@ class Log:
         return self.end_position_m is not None
 
 
-def read_log(folder: Path, period_s: float, latch_s: float) -> Log:
+def read_log(folder: Path, period_s: float) -> Log:
     """Read a run folder; RecordError where it can't be used, with the reason."""
     run = read_run(folder)
     rows = run.rows
@@ -72,10 +72,10 @@ def read_log(folder: Path, period_s: float, latch_s: float) -> Log:
     if not imported:
         rows = rows[np.isin(rows["run_phase"], [int(phase) for phase in TICKING])]
     session = str(int(rows["homing_id"][0])) if rows.size else ""
-    return _log_of_rows(rows, str(folder), period_s, latch_s, f"{folder.name if imported else ''}:{session}", imported)
+    return _log_of_rows(rows, str(folder), period_s, f"{folder.name if imported else ''}:{session}", imported)
 
 
-def _log_of_rows(rows: np.ndarray, name: str, period_s: float, latch_s: float, session: str, imported: bool) -> Log:
+def _log_of_rows(rows: np.ndarray, name: str, period_s: float, session: str, imported: bool) -> Log:
     """Put rows on the sensor's grid."""
     if rows.size < LEAST_SAMPLES_COUNT:
         raise RecordError(
@@ -130,7 +130,6 @@ def _log_of_rows(rows: np.ndarray, name: str, period_s: float, latch_s: float, s
         macro_position_m=macro,
         macro_command_n=command,
         valid=valid,
-        latch_s=latch_s,
         session=session,
         end_position_m=on_grid("end_position_m"),
         micro_command_n=on_grid("micro_force_n"),
