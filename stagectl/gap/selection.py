@@ -5,7 +5,7 @@ term stays when it gains on the recordings it was fitted on AND on recordings th
 best of the whole library gains on noise, and when it explains a share of what is reducible at all. Pure.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -70,23 +70,12 @@ class Solution:
 
 def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
     """Solve the amplitudes of `groups` on all of `sums`."""
-    scopes = {
-        "structural": ("",),
-        "session": tuple(sorted({f"session {s.session}" for s in sums})),
-        "run": tuple(sorted({f"run {s.run}" for s in sums})),
-    }
-    slots: list[tuple[int, str]] = []
-    precision: list[float] = []
-    for group in groups:
-        for scope in scopes[group.scope]:
-            for number, column in enumerate(group.columns):
-                slots.append((column, scope))
-                precision.append(group.prior_sds[number] ** -2 if group.prior_sds else 0.0)
+    slots, precision = _slots_of(groups, sums)
     size = len(slots)
     normal = np.diag(np.array(precision)) if size else np.zeros((0, 0))
     right = np.zeros(size)
     for s in sums:
-        here = [k for k, (_, scope) in enumerate(slots) if scope in ("", f"session {s.session}", f"run {s.run}")]
+        here = [k for k, (_, scope) in enumerate(slots) if _covers(scope, s)]
         columns = [slots[k][0] for k in here]
         normal[np.ix_(here, here)] += s.gram[np.ix_(columns, columns)]
         right[here] += s.gram[columns, 0]
@@ -143,12 +132,12 @@ class Judge:
     thresholds: tuple[float, float] = (0.0, 0.0)
     trace: list[str] = field(default_factory=list)
 
-    def gains(self, groups: Sequence[Group], sums: tuple[list[Sums], list[Sums]] | None = None) -> tuple[float, float]:
+    def gains(self, groups: Sequence[Group]) -> tuple[float, float]:
         """Return (gain on training, gain on held-out recordings) of base and `groups`.
 
         Without recordings kept apart, each training recording is held out once.
         """
-        training, held = (self.training, self.held) if sums is None else sums
+        training, held = self.training, self.held
         whole = solve([*self.base, *groups], training)
         if held:
             return whole.gain, held_out_gain(whole, held)
@@ -162,14 +151,36 @@ class Judge:
 
     def calibrate(self) -> None:
         """Set thresholds: the quantile of the best gains of the whole library on noise."""
-        draws_count = self.training[0].nulls.shape[0]
-        best = np.zeros((draws_count, 2))
-        for k in range(draws_count):
-            sums = ([_on_noise(s, k) for s in self.training], [_on_noise(s, k) for s in self.held])
-            none = self.gains([], sums)
-            gains = [self.gains([group], sums) for group in self.library]
-            best[k] = max(g[0] - none[0] for g in gains), max(g[1] - none[1] for g in gains)
-        self.thresholds = (float(np.quantile(best[:, 0], NULL_QUANTILE)), float(np.quantile(best[:, 1], NULL_QUANTILE)))
+        best = np.zeros((2, self.training[0].nulls.shape[0]))
+        for _, trained, apart in self.additions([], on_noise=True):
+            best = np.maximum(best, [trained, apart])
+        self.thresholds = (float(np.quantile(best[0], NULL_QUANTILE)), float(np.quantile(best[1], NULL_QUANTILE)))
+
+    def additions(
+        self, chosen: Sequence[Group], on_noise: bool = False
+    ) -> Iterator[tuple[Group, np.ndarray, np.ndarray]]:
+        """Yield what each term of the library gains beside `chosen`, on training and on held-out recordings.
+
+        Shape (1,) each; with `on_noise` one element a draw of noise in the innovations' place. The same as `gains`
+        with and without the term, at the cost of one elimination a fold instead of one a term.
+        """
+        whole = _Fold([*self.base, *chosen], self.training, self.held or self.training, on_noise)
+        folds = [whole]
+        if not self.held and len(self.training) > 1:
+            folds = [
+                _Fold([*self.base, *chosen], self.training[:k] + self.training[k + 1 :], [self.training[k]], on_noise)
+                for k in range(len(self.training))
+            ]
+        taken = {group.key for group in chosen}
+        for group in self.library:
+            if group.key in taken:
+                continue
+            trained, apart = whole.added(group)
+            if folds[0] is not whole:
+                apart = sum((fold.added(group)[1] for fold in folds), np.zeros(1))
+            elif not self.held:
+                apart = trained
+            yield group, trained, apart
 
     def reducible(self, groups: Sequence[Group]) -> tuple[float, float]:
         """Return what is left above the floor on training and held-out recordings, in squares of the noise."""
@@ -183,15 +194,12 @@ class Judge:
         """Add the best term as long as one stays, then take back what the others have made superfluous."""
         chosen: list[Group] = []
         while len(chosen) < most:
-            now = self.gains(chosen)
             left = self.reducible(chosen)
             ranked = []
-            taken = {group.key for group in chosen}
-            for group in self.library:
-                if group.key in taken or not self._allowed([*chosen, group]):
+            for group, trained, apart in self.additions(chosen):
+                if self._stays(float(trained[0]), float(apart[0]), left) and not self._allowed([*chosen, group]):
                     continue
-                gains = self.gains([*chosen, group])
-                ranked.append((gains[0] - now[0], gains[1] - now[1], group))
+                ranked.append((float(trained[0]), float(apart[0]), group))
             passing = [row for row in ranked if self._stays(row[0], row[1], left) and self._agrees(chosen, row[2])]
             price = self._price()
             best = max(passing, key=lambda row: row[0] + row[1] - price * row[2].complexity, default=None)
@@ -306,9 +314,94 @@ class Judge:
         return sorted(((key, margin) for key, margin in margins.items() if margin < limit), key=lambda row: row[1])
 
 
-def _on_noise(s: Sums, draw: int) -> Sums:
-    """Return the sums that one draw of noise would have given."""
-    gram = s.gram.copy()
-    gram[0, 1:] = gram[1:, 0] = s.nulls[draw]
-    gram[0, 0] = s.count
-    return Sums(gram, s.count, s.session, s.run, s.nulls)
+class _Fold:
+    """Groups solved on some recordings and judged on others, ready to say what one more group would gain."""
+
+    def __init__(self, groups: Sequence[Group], fitted: Sequence[Sums], judged: Sequence[Sums], on_noise: bool):
+        self._fitted, self._judged, self._on_noise = fitted, judged, on_noise
+        self._slots, precision = _slots_of(groups, fitted)
+        self._rights = {id(s): _right(s, on_noise) for s in [*fitted, *judged]}
+        normal = self._cross(self._slots, self._slots, fitted) + np.diag(precision)
+        scale = np.sqrt(np.diag(normal))
+        scale[scale == 0.0] = 1.0
+        weights = np.outer(scale, scale)
+        self._inverse = np.linalg.inv(normal / weights + _JITTER * np.eye(scale.size)) / weights
+        self._values = self._inverse @ self._seen(self._slots, fitted)
+        self._apart = self._judged_gain(self._slots, self._values)
+
+    def added(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
+        """Return (gain where it is fitted, gain where it is judged) of one group more, one element a right side."""
+        slots, precision = _slots_of([group], self._fitted)
+        cross = self._cross(self._slots, slots, self._fitted)
+        back = self._inverse @ cross
+        normal = self._cross(slots, slots, self._fitted) + np.diag(precision) - cross.T @ back
+        right = self._seen(slots, self._fitted) - cross.T @ self._values
+        scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+        if not np.all(scale > 0.0):
+            return np.zeros(right.shape[1]), np.zeros(right.shape[1])
+        weights = np.outer(scale, scale)
+        values = np.linalg.solve(normal / weights + _JITTER * np.eye(scale.size), right / scale[:, None]) / scale[:, None]
+        together = np.vstack([self._values - back @ values, values])
+        gain = np.einsum("ij,ij->j", right, values)
+        return gain, self._judged_gain([*self._slots, *slots], together) - self._apart
+
+    def _judged_gain(self, slots: list[tuple[int, str]], values: np.ndarray) -> np.ndarray:
+        fixed = [k for k, (_, scope) in enumerate(slots) if scope == ""]
+        own = sorted({column for column, scope in slots if scope != ""})
+        columns, theta = [slots[k][0] for k in fixed], values[fixed]
+        total = np.zeros(values.shape[1])
+        for s in self._judged:
+            right = self._rights[id(s)]
+            bent = s.gram[np.ix_(columns, columns)] @ theta
+            total += 2.0 * np.einsum("ij,ij->j", theta, right[columns]) - np.einsum("ij,ij->j", theta, bent)
+            if own:
+                rest = right[own] - s.gram[np.ix_(own, columns)] @ theta
+                normal = s.gram[np.ix_(own, own)]
+                normal = normal + _JITTER * np.trace(normal) * np.eye(len(own))
+                total += np.einsum("ij,ij->j", rest, np.linalg.solve(normal, rest)) - len(own)
+        return total
+
+    def _seen(self, slots: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
+        total = np.zeros((len(slots), self._rights[id(sums[0])].shape[1]))
+        for s in sums:
+            here = [k for k, (_, scope) in enumerate(slots) if _covers(scope, s)]
+            total[here] += self._rights[id(s)][[slots[k][0] for k in here]]
+        return total
+
+    @staticmethod
+    def _cross(a: list[tuple[int, str]], b: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
+        total = np.zeros((len(a), len(b)))
+        for s in sums:
+            rows = [k for k, (_, scope) in enumerate(a) if _covers(scope, s)]
+            columns = [k for k, (_, scope) in enumerate(b) if _covers(scope, s)]
+            part = s.gram[np.ix_([a[k][0] for k in rows], [b[k][0] for k in columns])]
+            total[np.ix_(rows, columns)] += part
+        return total
+
+
+def _covers(scope: str, s: Sums) -> bool:
+    return scope in ("", f"session {s.session}", f"run {s.run}")
+
+
+def _right(s: Sums, on_noise: bool) -> np.ndarray:
+    """Return what the columns see, row 0 the innovations' own square, shape (1 + columns, right sides)."""
+    if not on_noise:
+        return s.gram[:, :1]
+    return np.vstack([np.full(s.nulls.shape[0], s.count), s.nulls.T])
+
+
+def _slots_of(groups: Sequence[Group], sums: Sequence[Sums]) -> tuple[list[tuple[int, str]], list[float]]:
+    """Return (column, scope) of every amplitude of some groups, and how well each is known beforehand."""
+    scopes = {
+        "structural": ("",),
+        "session": tuple(sorted({f"session {s.session}" for s in sums})),
+        "run": tuple(sorted({f"run {s.run}" for s in sums})),
+    }
+    slots: list[tuple[int, str]] = []
+    precision: list[float] = []
+    for group in groups:
+        for scope in scopes[group.scope]:
+            for number, column in enumerate(group.columns):
+                slots.append((column, scope))
+                precision.append(group.prior_sds[number] ** -2 if group.prior_sds else 0.0)
+    return slots, precision
