@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sim_backend.machine import load_machine
+from sim_backend.machine import Machine, load_machine
 from stagectl import trajectory
 from stagectl.backend import BatchBackend
-from stagectl.profile import load_profile
+from stagectl.profile import Profile, load_profile
 from stagectl.record import Run, read_run
 from stagectl.replay import replay_run
 from stagectl.supervisor import Supervisor
@@ -28,9 +28,14 @@ class Replayed:
 
 
 def record(name: str, seed: int, folder: Path) -> Run:
+    """Record a shipped machine under its profile."""
+    return record_of(load_profile(name), load_machine(name), seed, folder)
+
+
+def record_of(profile: Profile, machine: Machine, seed: int, folder: Path) -> Run:
     """Home a machine and move it under every law; homing, switching and stopping are part of the run."""
-    backend = BatchBackend(load_machine(name), seed=seed)
-    with Supervisor(load_profile(name), backend, folder) as stage:
+    backend = BatchBackend(machine, seed=seed)
+    with Supervisor(profile, backend, folder) as stage:
         stage.home()
         for law in LAW_NAMES:
             if stage.enable(law) == 0:

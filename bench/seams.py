@@ -94,6 +94,7 @@ def compare(
     late = rows["sequence"] < rows["cycle"]
     start_t_ns = backend.rig.start_t_ns
     following = np.append(in_truth, in_truth[-1] + 1)
+    devices["sampled_s"] = 1e-9 * (truth["t_ns"][in_truth[0] - 1] - start_t_ns)
     instants_s = np.zeros((rows.size + 1, 2))
     instants_s[:, 0] = 1e-9 * (truth["t_ns"][following] - start_t_ns)
     instants_s[:-1, 1] = 1e-9 * (rows["sync_end_t_ns"] - start_t_ns)

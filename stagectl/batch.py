@@ -32,6 +32,7 @@ DEVICES = np.dtype(
         ("macro_a", "f8"),  # commands that the drives hold
         ("micro_a", "f8"),
         ("sample", "f8"),  # number of the next sample
+        ("sampled_s", "f8"),  # instant of the last sample, for what the sensors remember
         ("mean_from_s", "f8"),  # instant of the last sample, and the end's position integral there
         ("mean_from_m_s", "f8"),
         ("late_sample", "f8"),  # whose line comes a cycle late; -1 = none
@@ -67,7 +68,8 @@ def run(setpoints, noise_m, late, instants_s, devices, state, parameters, machin
     for k in range(setpoints.size):
         t_s, latch_s = instants_s[k, 0], instants_s[k, 1]
         plant_module.advance(state, parameters, machine_effects, t_s, d.longest_substep_s, d.macro_a, d.micro_a, 1, 1)
-        macro_error_m, end_error_m = plant_module.sense(state, parameters, machine_effects, t_s - d.mean_from_s)
+        macro_error_m, end_error_m = plant_module.sense(state, parameters, machine_effects, t_s - d.sampled_s)
+        d.sampled_s = t_s
         truth[k].t_s = t_s
         truth[k].end_mean_m = s.end_position_m - d.end_origin_m - d.end_zero_m
         if t_s > d.mean_from_s:

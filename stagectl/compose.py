@@ -45,6 +45,7 @@ def along(columns, parameters, memory):
 '''
 
 _COMMANDS = ("macro_command", "micro_command")
+_STEP_S, _STEPS = 1e-4, 4000  # of a step response: twenty of the largest time constant
 
 _SUBSTEP = '''
 
@@ -161,11 +162,17 @@ def _forces_source(structure: tuple[tuple[str, str], ...]) -> str:
         calls[place].append(call)
         if place in at_once and not known.memory:
             at_once[place].append(call)
-    calls |= {f"{place}_at_once": lines_of for place, lines_of in at_once.items()}
+    calls |= {f"{place}_at_once": body for place, body in at_once.items()}
     for function, body in calls.items():
         quantities = QUANTITIES_OF[function.removesuffix("_at_once")]
         lines += ["", "", "@inlined", f"def {function}({', '.join(quantities)}, memory, p):", "    total = 0.0"]
         lines += [*body, "    return total"]
+    for place, body in at_once.items():
+        lines += ["", "", "@inlined", f"def {place}_lost(wanted_a, t_s, dt_s, memory, p):", "    lost_a = 0.0"]
+        if body:  # the command that makes up for its own loss: a fixed point, that of a dead band d above d / 1000
+            lines += ["    for _ in range(10):"]
+            lines += [f"        lost_a = {place}_at_once(wanted_a - lost_a, t_s, dt_s, memory, p)"]
+        lines += ["    return lost_a"]
     return "\n".join(lines) + "\n"
 
 
@@ -199,8 +206,22 @@ def forces_module(structure: tuple[tuple[str, str], ...]) -> ModuleType:
     """Return the module with one compiled function a place (see `stagectl.effects.PLACES`).
 
     `macro_command_at_once` and `micro_command_at_once` leave out what has a memory: the part that a law can undo.
+    `macro_command_lost` and `micro_command_lost` give what that part adds to the command that makes up for it.
     """
     return generated_module("forces", _forces_source(structure))
+
+
+def command_lag_s(effects: Iterable[Mapping[str, Any]], place: str) -> float:
+    """Return by how much the effects with memory at `place` hold a command up: what a unit step loses, s."""
+    lost_s = 0.0
+    for row in _check(effects):
+        known = CATALOGUE[row["name"]]
+        if row["acts_on"] == place and known.memory:
+            given = {"command_a": 1.0, "dt_s": _STEP_S}
+            rows = np.array([[(given | {"t_s": k * _STEP_S})[key] for key in known.quantities] for k in range(_STEPS)])
+            values = np.array([float(row[key]) for key in known.parameters])
+            lost_s -= _STEP_S * float(np.sum(along(known)(rows, values, np.zeros(known.memory))))
+    return lost_s
 
 
 def along(known: Effect) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:

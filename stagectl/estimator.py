@@ -4,11 +4,13 @@ The believed machine is the same plant code as the simulator's, composed with th
 two samples it feels the integers that were sent: the old command until the SYNC that latches the new one, then
 the new one. A sample corrects position, velocity and an unknown force on each axis (a random walk), with the
 steady-state gains of the Kalman filter for that model. Prediction from the sample's instant to the instant the
-next command acts is the same code run ahead. Pure; knows no bus and no clock.
+next command acts, lag and dead time of the profile's command effects included, is the same code run ahead. Pure;
+knows no bus and no clock.
 """
 
 import numpy as np
 
+from stagectl import compose
 from stagectl.compiled import compiled
 from stagectl.plant import PLANT_PARAMETERS, PLANT_STATE
 
@@ -16,6 +18,8 @@ ESTIMATOR = np.dtype(
     [
         ("period_s", "f8"),
         ("actuation_delay_s", "f8"),  # sample instant -> the SYNC that latches the command
+        ("lead_s", "f8"),  # from there until the force of the axis that carries the end follows, lag and dead time
+        ("macro_lead_s", "f8"),  # by which the macro's lag and dead time under a micro are longer than that
         ("longest_substep_s", "f8"),
         ("bridged_samples_max", "f8"),  # missing in a row that the identification's filters are carried over
         ("macro_amperes_per_word", "f8"),
@@ -107,6 +111,9 @@ def init(profile) -> np.ndarray:
     period_s = 1.0 / profile.cycle.rate_hz
     e["period_s"] = period_s
     e["actuation_delay_s"] = profile.cycle.actuation_delay_s
+    macro_lag_s = compose.command_lag_s(profile.effects, "macro_command")
+    e["lead_s"] = macro_lag_s if profile.micro is None else compose.command_lag_s(profile.effects, "micro_command")
+    e["macro_lead_s"] = macro_lag_s - e["lead_s"]
     e["longest_substep_s"] = 300e-6
     e["bridged_samples_max"] = _BRIDGED_SAMPLES
     e["position_mode"] = float(profile.macro.mode == "position")

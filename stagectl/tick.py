@@ -78,7 +78,7 @@ def estimate(m, e, model, ahead, b, q, p):
             x.micro_word_before = x.micro_word
         x.cycle = m.cycle
     ahead[0] = model[0]
-    plant_module.advance(ahead, q, p, s.t_s + x.actuation_delay_s, x.longest_substep_s,
+    plant_module.advance(ahead, q, p, s.t_s + x.actuation_delay_s + x.lead_s, x.longest_substep_s,
                          x.macro_word * x.macro_amperes_per_word, x.micro_word * x.micro_amperes_per_word, 1, 1)
 
 
@@ -113,7 +113,7 @@ def decide(m, now, later, e, ahead, after, l, q, p):
         micro_n -= forces.micro_actuator(end_m, end_m_per_s, f.end_acceleration_m_per_s2, q[0].micro_mass_kg,
                                          relative_m, rate, a.micro_current_a, micro_n, micro_n, t_s, dt_s, memory, p)
         k = q[0].micro_force_constant_n_per_a
-        micro_n -= k * forces.micro_command_at_once(micro_n / k, t_s, dt_s, memory, p)
+        micro_n -= k * forces.micro_command_lost(micro_n / k, t_s, dt_s, memory, p)
         micro_n = reference.limited(micro_n, l[0].precision_force_limit_n)
         macro_known_n -= joint_n
         macro_known_n += forces.macro_force(macro_m, macro_m_per_s, f.macro_acceleration_m_per_s2, q[0].macro_mass_kg,
@@ -125,6 +125,8 @@ def decide(m, now, later, e, ahead, after, l, q, p):
         else:
             macro_n = law.carrier(l[0], a, f, x, now, later, q[0].macro_mass_kg, macro_known_n,
                                   a.macro_disturbance_n, q[0], x.period_s)
+            # What differs from the micro's lag: its own inertia and the micro's reaction, carried on at constant jerk.
+            macro_n += (q[0].macro_mass_kg + q[0].micro_mass_kg) * later.jerk_m_per_s3 * x.macro_lead_s
     else:
         macro_known_n += forces.macro_force(macro_m, macro_m_per_s, f.macro_acceleration_m_per_s2, q[0].macro_mass_kg,
                                             0.0, 0.0, a.macro_current_a, a.macro_force_n, 0.0, t_s, dt_s, memory, p)
@@ -133,7 +135,7 @@ def decide(m, now, later, e, ahead, after, l, q, p):
     macro_n -= forces.macro_actuator(macro_m, macro_m_per_s, f.macro_acceleration_m_per_s2, q[0].macro_mass_kg,
                                      relative_m, rate, a.macro_current_a, macro_n, micro_n, t_s, dt_s, memory, p)
     k = q[0].macro_force_constant_n_per_a
-    macro_n -= k * forces.macro_command_at_once(macro_n / k, t_s, dt_s, memory, p)
+    macro_n -= k * forces.macro_command_lost(macro_n / k, t_s, dt_s, memory, p)
     if x.position_mode == 0.0:
         macro_n = reference.limited(macro_n, l[0].macro_force_limit_n)
     return macro_n, micro_n
@@ -147,7 +149,7 @@ def tick(measurement, setpoint, later, command, e, model, ahead, after, l, g, b,
     c = command[0]
     x = e[0]
     estimate(m, e, model, ahead, b, q, p)
-    reference.extrapolate(later[0], now, x.actuation_delay_s)
+    reference.extrapolate(later[0], now, x.actuation_delay_s + x.lead_s)
     macro_n, micro_n = 0.0, 0.0
     if x.started != 0.0:  # before the first sample nothing is known: no force
         macro_n, micro_n = decide(m, now, later[0], e, ahead, after, l, q, p)
@@ -163,7 +165,7 @@ def tick(measurement, setpoint, later, command, e, model, ahead, after, l, g, b,
         if q[0].has_micro != 0.0:
             c.micro_word = int(np.floor(micro_n / micro_step_n + 0.5))
     goal = later[0]  # the drive interpolates: it arrives at a target one period after the SYNC that latches it
-    h = x.period_s
+    h = x.period_s - x.lead_s
     c.macro_target_m = reference.gap_centre(q[0]) + goal.position_m - goal.relative_position_m + h * (
         goal.velocity_m_per_s - goal.relative_velocity_m_per_s
         + 0.5 * h * (goal.acceleration_m_per_s2 - goal.relative_acceleration_m_per_s2))

@@ -75,7 +75,7 @@ WORKED: dict[str, list[Case]] = {
     # ---- inertia ----
     "micro_reaction": [Case((12.0, 1.0), -12.0), Case((-8.0, 0.25), 2.0)],
     "mass_error": [Case((0.5, 70.0, 0.02), -0.7), Case((-2.0, 40.0, -0.01), -0.8)],
-    # w = 100 rad/s, mu = 0.36. Asked only: (0.6 - 0.1) + 2 x 0.1 x 100 x 2e-3 + 1e4 x 1e-5 = 0.64, F = 0.36 / 0.64 of it
+    # w = 100 rad/s, mu = 0.36. Asked only: 0.6 - 0.1 + 2 x 0.1 x 100 x 2e-3 + 1e4 x 1e-5 = 0.64; F = 0.36 / 0.64 of it
     # x 70 kg. From rest under 1 m/s^2 with damping 0.48, that is 0.6 at 125 rad/s, a quarter of the damped period
     # (100 rad/s): shrink = exp(-3 pi / 8) = 0.30786397132849900, q = -1e-4 + 0.75e-4 shrink, q' = -shrink / 64,
     # F / m = -0.36 q' / (pi / 200)
@@ -223,3 +223,19 @@ def motion(rows: int = 3000, dt_s: float = 1e-3) -> dict[str, np.ndarray]:
 def columns(name: str, quantities: dict[str, np.ndarray]) -> np.ndarray:
     """Return the quantities of an effect side by side, in the order of its declaration."""
     return np.ascontiguousarray(np.column_stack([quantities[key] for key in CATALOGUE[name].quantities]))
+
+
+def everything_that_remembers() -> list[dict]:
+    """Return a table of every law with memory, of sizes that a stage works with, and one for every other new place."""
+    return [
+        table("dahl_friction", "macro_force", level_n=1.0),
+        table("lugre_friction", "micro_force", level_n=0.1),
+        table("cable_hysteresis", "macro_force", level_n=2.0),
+        table("flexible_mode", "macro_force", share_ratio=0.05, frequency_hz=90.0),
+        table("current_loop_lag", "macro_command", time_constant_s=0.1e-3),
+        table("command_delay", "micro_command", delay_s=0.1e-3),
+        table("sensor_lag", "end_sensor", time_constant_s=0.1e-3),
+        table("cyclic_error", "macro_sensor"),
+        table("cubic_stiffness", "joint"),
+        table("backlash_width_change", change_m=2e-6),
+    ]

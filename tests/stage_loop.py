@@ -41,13 +41,16 @@ class Loop:
         d, m, c = one.devices[0], one.controller.measurement, one.controller.command
         t_s = d["sample"] * d["period_s"]
         self._advance(t_s)
+        sensed_m = one.module.plant_module.sense(one.state, one.parameters, one.effects, t_s - d["sampled_s"])
+        d["sampled_s"] = t_s
         self.true_macro_m = float(one.state["macro_position_m"][0])
         self.true_end_m = float(one.state["end_position_m"][0])
         noise_m = one.noise.standard_normal(2) * one.noise_m
         seen = [
-            float(np.floor((true_m + n) / step + 0.5) * step)
-            for true_m, n, step in zip(
+            float(np.floor((true_m + added_m + n) / step + 0.5) * step)
+            for true_m, added_m, n, step in zip(
                 (self.true_macro_m, self.true_end_m),
+                sensed_m,
                 noise_m,
                 (d["macro_resolution_m"], d["end_resolution_m"]),
                 strict=True,

@@ -522,6 +522,16 @@ def test_a_free_mode_rings_above_its_frequency_with_the_axis_held(share, frequen
     assert swings[5] / swings[0] == pytest.approx(math.exp(-10.0 * math.pi * free_zeta), rel=0.2)
 
 
+@pytest.mark.parametrize("longest_s", [50e-6, 300e-6])
+def test_a_mode_is_stable_at_the_observers_substep(longest_s):
+    """Stepped with the axis' own acceleration it diverged at 200 Hz and 0.3 ms."""
+    mode = table("flexible_mode", "macro_force", share_ratio=0.5, frequency_hz=500.0, damping_ratio=0.01)
+    bench = Bench([mode], {"has_micro": 0.0})
+    bench.advance(1e-3, macro_a=7.0, longest_s=longest_s)
+    bench.advance(0.5, longest_s=longest_s)
+    assert bench["macro_velocity_m_per_s"] == pytest.approx(1e-3, rel=1e-2)
+
+
 def test_a_late_command_is_felt_late():
     bench = Bench([table("command_delay", "macro_command", delay_s=0.7e-3)], {"has_micro": 0.0})
     bench.advance(0.69e-3, macro_a=7.0)

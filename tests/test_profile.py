@@ -502,8 +502,14 @@ def test_single_axis_refuses_what_needs_a_micro(bench):
         {"name": "viscous_friction", "acts_on": "micro_force", "damping_n_s_per_m": 1.0},
         {"name": "contact_damping", "acts_on": "contact", "damping_n_s_per_m": 1.0},
     ]
+    effects += [
+        {"name": "linear_stiffness", "acts_on": "joint", "stiffness_n_per_m": 1.0},
+        {"name": "backlash_wear", "acts_on": "contact_edge", "rate_m_per_s": 1e-9},
+        {"name": "amplifier_dead_band", "acts_on": "micro_command", "half_width_a": 0.01},
+        {"name": "scale_error", "acts_on": "end_sensor", "error_ppm": 1.0},
+    ]
     lines = refusal(bench, changed(single, {"effects": effects})).splitlines()
-    assert [line.split(": ")[1].split(" = ")[0] for line in lines] == [f"effects[{n}].name" for n in range(3)]
+    assert [line.split(": ")[1].split(" = ")[0] for line in lines] == [f"effects[{n}].name" for n in range(7)]
     fields = tomllib.loads(OLED.read_text())["interferometer"]["frame"]["fields"]
     text = refusal(bench, changed(single, {"interferometer.frame.fields": fields}))
     assert "the stream carries an end, and there is no [micro]" in text

@@ -11,12 +11,25 @@ from stagectl.record import Recorder, Run, read_run
 from stagectl.replay import replay, replay_run
 from stagectl.row import new_rows
 from stagectl.tracker import LAW_NAMES
+from tests.effect_numbers import everything_that_remembers
+from tests.stage import with_values
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A run of the machine with one axis: homing, both laws, stops."""
     return replaying.record("single-axis", 3, tmp_path_factory.mktemp("replay") / "single-axis")
+
+
+def test_what_effects_remember_is_replayed(oled_profile, oled_machine, tmp_path):
+    """A memory is a part of the observer's state: in the snapshot, in its copies, forgotten at a fresh start."""
+    extra = everything_that_remembers()
+    profile = with_values(oled_profile, effects=(*oled_profile.effects, *extra))
+    machine = with_values(oled_machine, effects=(*oled_machine.effects, *extra))
+    run = replaying.record_of(profile, machine, 4, tmp_path / "remembers")
+    assert np.sum(run.rows["setpoint_velocity_m_per_s"] != 0.0) > 600
+    found = replay_run(run)
+    assert found.differing_rows == 0, found.first_difference
 
 
 @pytest.mark.parametrize("name", replaying.MACHINES)
