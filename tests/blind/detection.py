@@ -9,7 +9,7 @@ the loop gives the same numbers (`tests/test_blind.py` holds the two together).
 
 import copy
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -17,11 +17,12 @@ from scipy import fft, stats
 from scipy.interpolate import CubicSpline
 
 from tests.blind import laws, machine
-from tests.blind.draw import PARAMETER_ERRORS, SENSOR_QUANTUM_M, coloured_power, simulate
+from tests.blind.draw import PARAMETER_ERRORS, SENSOR_QUANTUM_M, coloured_power, follows, simulate
 from tests.blind.laws import contact_force, friction_level, is_friction, smooth_force, thrust
 from tests.blind.machine import CELLS, SAMPLE_S, STEPS, B
 
 D_PRIME_AT_LIMIT = 5.0
+LIMIT_ROUNDS = 3
 FALSE_RATE = 0.05
 POWER = 0.9
 SEPARABLE_D = float(stats.norm.ppf(POWER) + stats.norm.ppf(1.0 - FALSE_RATE))  # 2.93: power 0.9 at 5 % false
@@ -282,7 +283,9 @@ class Evidence:
             x = run.cells[:, 2 * place]
             constant = self.base[B["macro_force_constant_n_per_a"] + place]
             plain = run.cells[:, 4 + place]
-            return self._drive_channels(run, place, _thrust_along(law.code, p, constant, plain / constant, x) - plain, None)
+            return self._drive_channels(
+                run, place, _thrust_along(law.code, p, constant, plain / constant, x) - plain, None
+            )
         if law.family == "sensor":
             return self._sensor_channels(run, place, self._reading_errors(run, law, place, p))
         forces = along(
@@ -492,26 +495,29 @@ def amplitude(effect):
 def limit_of(case, evidence, index, columns):
     """(d', limit): d' of effect `index` given the others, and the amplitude where it would be 5.
 
-    The first guess takes d' as proportional; where it lies within a factor of 8 the case is simulated there and the limit
-    interpolated between the two.
+    d' isn't proportional to the amplitude where the loop's answer to the effect is itself uncertain, so the case is
+    simulated again near the limit, at most three times.
     """
-    others = [column for i, column in enumerate(columns) if i != index]
-    own = evidence.d_prime(columns[index], others)
+    own = evidence.d_prime(columns[index], [column for i, column in enumerate(columns) if i != index])
     size = amplitude(case.effects[index])
     if own <= 0.0:
         return 0.0, math.inf
-    limit = size * D_PRIME_AT_LIMIT / own
-    if len(case.effects) == 1 and 1.0 / 8.0 < limit / size < 8.0 and not 0.8 < limit / size < 1.25:
-        there = [case.effects[index].scaled(limit / size)]
-        runs = simulate(case, there)
-        if all(np.all(np.isfinite(run.samples)) for run in runs):
-            other = Evidence(case, runs)
-            probe = other.d_prime(other.effect_column(0))
-            if probe > 0.0 and abs(math.log(own / probe)) > 0.05:
-                slope = math.log(size / limit) / math.log(own / probe)
-                slope = min(max(slope, 0.3), 3.0)
-                limit *= (D_PRIME_AT_LIMIT / probe) ** slope
-    return own, limit
+    scale, probe = 1.0, own
+    for _ in range(LIMIT_ROUNDS):
+        if abs(math.log(probe / D_PRIME_AT_LIMIT)) < 0.1:
+            break
+        scale *= min(max(D_PRIME_AT_LIMIT / probe, 1.0 / 30.0), 30.0)
+        effects = [effect.scaled(scale) if i == index else effect for i, effect in enumerate(case.effects)]
+        there = replace(case, effects=effects)
+        runs = simulate(there)
+        if not follows(runs):
+            return own, size * scale  # it would be seen long before the loop fails
+        other = Evidence(there, runs)
+        marks = [other.effect_column(i) for i in range(len(effects))]
+        probe = other.d_prime(marks[index], [mark for i, mark in enumerate(marks) if i != index])
+        if probe <= 0.0:
+            return own, math.inf
+    return own, size * scale * D_PRIME_AT_LIMIT / probe
 
 
 def judged(case, separate=True):

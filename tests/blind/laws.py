@@ -360,7 +360,18 @@ VISCOUS, ASYMMETRIC_VISCOUS, COULOMB, ASYMMETRIC_COULOMB, OFFSET, STRIBECK, SUBL
 DAHL, LUGRE, LOAD_DEPENDENT, QUADRATIC, COGGING, RIPPLE, SATURATION = 8, 9, 10, 11, 12, 13, 14
 CABLE_SPRING, CABLE_HYSTERESIS, TILT, LINEAR_STIFFNESS, CUBIC, POSITION_FRICTION = 16, 17, 18, 19, 20, 21
 CENTRE, WEAR, CONTACT_DAMPING, SOFT, CONTACT_HYSTERESIS, REACTION, FLEXIBLE, VIBRATION = 22, 23, 24, 25, 26, 27, 28, 29
-LAG, DELAY, DEAD_BAND, SENSOR_DELAY, SENSOR_LAG, SCALE, CYCLIC, DRIFT, ABBE, SKEW = 30, 31, 32, 33, 34, 35, 36, 37, 38, 39
+LAG, DELAY, DEAD_BAND, SENSOR_DELAY, SENSOR_LAG, SCALE, CYCLIC, DRIFT, ABBE, SKEW = (
+    30,
+    31,
+    32,
+    33,
+    34,
+    35,
+    36,
+    37,
+    38,
+    39,
+)
 SINCE_REVERSAL, ROOT_PERIODIC, ONE_WAY, DEAD_ZONE, ACCELERATION_SIGN = 101, 102, 103, 104, 105
 VELOCITY_PERIODIC, RINGING, SPEED_SINE, LAST_REVERSAL, BUMPS = 106, 107, 108, 109, 110
 
@@ -434,8 +445,8 @@ def smooth_force(code, p, mem, dt, t, x, v, r, drive, other, mass, micro):
             c, s = math.cos(wd * dt), math.sin(wd * dt)
             q = e * (stretch * c + (speed + d * stretch) / wd * s)
             qd = e * (speed * c - (d * speed + w * w * stretch) / wd * s)
+            # mem belongs to the middle of a step, where x is: the force is that of before it moves on
             mem[0], mem[1] = x + v * dt + q, v + qd
-            stretch, speed = 0.5 * (stretch + q), 0.5 * (speed + qd)
         return attached * (w * w * stretch + 2.0 * p[2] * w * speed)
     if code == VIBRATION:
         return -mass * p[0] * math.sin(2.0 * math.pi * p[1] * t + p[2])

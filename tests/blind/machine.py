@@ -144,6 +144,8 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
     lagged = np.zeros(effects)
     state = np.zeros(CONTROL_STATE)
     x1, x2 = reference[0, 0] - relative[0, 0], reference[0, 0]
+    if single:
+        x2 = 0.0
     v1, v2 = 0.0, 0.0
     fine1[0], fine2[0] = x1, x2
     m1, m2 = base[0], base[1] + payload
@@ -286,6 +288,7 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                     if is_friction(code) or (13 <= code <= 14) or (22 <= code <= 26) or (30 <= code <= 39):
                         continue
                     both = code == 18 or code == 29
+                    dt = h if stage == 1 and code != 28 else 0.0
                     if places[e] == 0 or both:
                         f = smooth_force(code, p[e], mem[e], dt, now, x1, w1, r, drive1, drive2, whole1, False)
                         f1 += f
@@ -330,10 +333,13 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                         f = friction_level(codes[e], p[e], mem[e], 0.0, x2, v2, drive2, math.copysign(1.0, direction2))
                         marks[e, 1, cell] -= direction2 * f / CELL_STEPS
                 elif codes[e] == 28:  # the attached body's own inertia is missing from a rigid axis
+                    # and it moves on with the speed that the axis now has
                     if places[e] == 0:
                         marks[e, 0, cell] += p[e, 0] * whole1 * (v1 - old1) / h / CELL_STEPS
+                        smooth_force(28, p[e], mem[e], h, now, x1, v1, 0.0, 0.0, 0.0, whole1, False)
                     else:
                         marks[e, 1, cell] += p[e, 0] * whole2 * (v2 - old2) / h / CELL_STEPS
+                        smooth_force(28, p[e], mem[e], h, now, x2, v2, 0.0, 0.0, 0.0, whole2, True)
             x1 += 0.5 * h * v1
             x2 += 0.5 * h * v2
             if single:
@@ -347,9 +353,9 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                     target = fine[place] - slope * p[e, 0]  # a lag follows a ramp at this distance
                     before = fine[place - 1] - slope * p[e, 0]
                     lagged[e] = target + (lagged[e] - before) * math.exp(-h / p[e, 0])
-            cells[cell, 0] += x1 / CELL_STEPS
+            cells[cell, 0] += 0.5 * (fine1[place - 1] + x1) / CELL_STEPS
             cells[cell, 1] += 0.5 * (old1 + v1) / CELL_STEPS
-            cells[cell, 2] += x2 / CELL_STEPS
+            cells[cell, 2] += 0.5 * (fine2[place - 1] + x2) / CELL_STEPS
             cells[cell, 3] += 0.5 * (old2 + v2) / CELL_STEPS
             cells[cell, 4] += drive1 / CELL_STEPS
             cells[cell, 5] += drive2 / CELL_STEPS

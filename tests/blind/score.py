@@ -153,7 +153,9 @@ def summary(marks, truths):
     for name, bar in BARS.items():
         own = [mark for mark in marks if mark["category"] == name]
         figures.append(_figure(name, sum(mark["right"] for mark in own), len(own), bar))
-    parameters = [one for mark in marks if mark["category"] in ("single", "multi") for one in parameter_marks(mark["pairs"])]
+    parameters = [
+        one for mark in marks if mark["category"] in ("single", "multi") for one in parameter_marks(mark["pairs"])
+    ]
     median = float(np.median([error for error, _ in parameters])) if parameters else None
     covered = [cover for _, cover in parameters if cover is not None]
     low, high = clopper_pearson(sum(covered), len(covered))
@@ -201,7 +203,9 @@ def main(arguments=None):
         truths.append(truth)
         marks.append(score(json.loads((given.findings / path.parent.name / "findings.json").read_text()), truth))
     result = summary(marks, truths)
-    result["wrong"] = [{key: mark[key] for key in ("seed", "category", "why")} for mark in marks if mark["right"] is False]
+    result["wrong"] = [
+        {key: mark[key] for key in ("seed", "category", "why")} for mark in marks if mark["right"] is False
+    ]
     print(json.dumps(result, indent=1))
 
 
