@@ -1,4 +1,4 @@
-"""The truth generator of the gap suite: apart from the project, right in closed form, sealed, and marked by the bars."""
+"""The truth generator of the gap suite: apart from the project, right in closed form, sealed, marked by the bars."""
 
 import ast
 import json
@@ -119,7 +119,7 @@ def test_viscous_friction_ends_in_a_constant_speed():
 
 
 def test_a_flexible_mode_rings_at_its_frequency_and_keeps_momentum():
-    """Free-free: w = w0 / sqrt(1 - mass fraction); the rigid body with its attachment accelerates like the whole mass."""
+    """Free-free: w = w0 / sqrt(1 - mass fraction); body and attachment together accelerate like the whole mass."""
     samples, _, _ = free(4_000, forces=(7.0, 0.0), effects=[("flexible_mode", 0, (0.1, 20.0, 1e-6))])
     t = np.arange(4_000) * SAMPLE_S
     ringing = samples[:, 6] - 0.05 * t * t
@@ -425,7 +425,7 @@ def touching():
 
 @pytest.mark.parametrize(("name", "acts_on", "values"), CLOSED_LOOP)
 def test_the_closed_loop_shows_what_the_balance_says(touching, name, acts_on, values):
-    """Differences of the closed loop with and without an effect, under one noise, carry the whitened mark of the effect."""
+    """The closed loop with minus without an effect, under one noise, carries the whitened mark of the effect."""
     case = touching
     without = draw.simulate(case, [])
     case.effects = [draw.Effect(laws.BY_NAME[name], acts_on, values)]
@@ -505,6 +505,9 @@ OFFSET, STRIBECK = ["offset", "macro_force"], ["stribeck_friction", "macro_force
         (findings("coulomb_friction", aliases=[STRIBECK]), true_set(), "single", False),
         (findings("coulomb_friction", aliases=[STRIBECK]), true_set(inseparable=[STRIBECK]), "single", True),
         (findings("stribeck_friction", aliases=[["coulomb_friction", "macro_force"]]), true_set(), "single", False),
+        (findings("coulomb_friction", "offset"), true_set(names=("asymmetric_coulomb_friction",)), "single", True),
+        (findings("asymmetric_coulomb_friction"), true_set("multi", ("coulomb_friction", "offset")), "multi", True),
+        (findings("asymmetric_coulomb_friction"), true_set(), "single", False),
         (findings(verdict="nothing"), true_set(above=False), "below_limit", True),
         (findings("offset"), true_set(above=False), "below_limit", False),
         (findings("offset", "coulomb_friction"), true_set("multi", ("coulomb_friction", "offset")), "multi", True),

@@ -1,10 +1,10 @@
 """What a perfect observer could see: detection limits, parameter errors, and which laws no likelihood ratio separates.
 
-Given the recorded positions and commands, the balance of each axis leaves `mass x acceleration - known forces`. A hidden
-effect adds its own force to it, a wrong base parameter adds its column, sensor noise and the coloured force make its
-spectrum; the recorded current minus the current that the command makes is a further channel. That is the closed loop's
-likelihood, written where its noise is stationary: whitening the closed loop's differences by the noise propagated through
-the loop gives the same numbers (`tests/test_blind.py` holds the two together).
+Given the recorded positions and commands, the balance of each axis leaves `mass x acceleration - known forces`. A
+hidden effect adds its own force to it, a wrong base parameter adds its column, sensor noise and the coloured force make
+its spectrum; the recorded current minus the current that the command makes is a further channel. That is the closed
+loop's likelihood, written where its noise is stationary: whitening the closed loop's differences by the noise
+propagated through the loop gives the same numbers (`tests/test_blind.py` holds the two together).
 """
 
 import copy
@@ -27,7 +27,7 @@ FALSE_RATE = 0.05
 POWER = 0.9
 SEPARABLE_D = float(stats.norm.ppf(POWER) + stats.norm.ppf(1.0 - FALSE_RATE))  # 2.93: power 0.9 at 5 % false
 TAPER_S = 1.0
-SEPARATION_BAND_HZ = 150.0  # laws are told apart below this: it costs a cyclic error some, everything else nothing
+SEPARATION_BAND_HZ = 150.0  # laws are told apart below this: only a cyclic error has much above it
 CELL_S = SAMPLE_S / CELLS
 # a cell's weight in the force that the second difference of positions sees: a triangle of one sample to either side
 _UP = (np.arange(CELLS) + 0.5) / CELLS / CELLS
@@ -104,7 +104,7 @@ class Evidence:
     """The whitened record of a simulated case: what base parameters and effects would add to it."""
 
     def __init__(self, case, runs, band_hz=0.5 / SAMPLE_S):
-        """`runs`: the case simulated with the effects along which everything is judged; above `band_hz` nothing counts."""
+        """`runs`: simulated with the effects along which everything is judged; above `band_hz` nothing counts."""
         self.case, self.runs, self.band_hz = case, runs, band_hz
         self._plain = {}
         self.base = case.base
@@ -117,7 +117,7 @@ class Evidence:
     # ---- whitening ----
 
     def _whitening(self, run):
-        """Factors on the spectrum of each channel (two forces, two currents; None where there is none), and the taper."""
+        """(factors on the spectrum of each channel: two forces, two currents, None where absent; taper; FFT length)."""
         m = len(run.samples) - 2
         length = fft.next_fast_len(m, real=True)
         f = np.fft.rfftfreq(length, SAMPLE_S)
@@ -321,7 +321,7 @@ class Evidence:
     # ---- statistics ----
 
     def set_nuisance(self, free=(), without=()):
-        """Base parameters (but `without`) within their uncertainty, and `free` columns of any size, are projected out."""
+        """Projects out the base parameters but `without` within their uncertainty, and `free` columns of any size."""
         columns = [self.base_columns[name] * self.case.uncertainty[name] for name in self.names if name not in without]
         for column in free:
             norm = np.linalg.norm(column)
@@ -367,7 +367,7 @@ class Evidence:
     # ---- alternatives ----
 
     def alternatives(self, hints=()):
-        """Every library law at every place this stage has, over a grid of its parameters: (name, acts_on, signed, columns).
+        """Every library law at every place, over a grid of its parameters: (name, acts_on, signed, columns).
 
         hints: effects whose pitches and frequencies join the grids of the periodic laws.
         """
@@ -434,7 +434,7 @@ class Evidence:
 
 
 def _products(a, b):
-    """Scalar products of rows: einsum, because threaded matrix products of this shape cost ten times more on a busy host."""
+    """Scalar products of rows: by einsum, as threaded matrix products of this shape cost ten times more."""
     return np.einsum("ik,jk->ij", a, b)
 
 

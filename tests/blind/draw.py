@@ -345,7 +345,7 @@ def draw(seed, kind=None, duration_s=20.0):
 
 def _drawn_case(rng, seed, kind, duration_s):
     single = bool(rng.random() < 0.2)
-    n = int(round(duration_s / SAMPLE_S))
+    n = round(duration_s / SAMPLE_S)
     base = drawn_base(rng, single)
     recipes = drawn_recipes(rng, single)
     homings = int(rng.integers(1, 3))

@@ -93,19 +93,20 @@ def runs_text(case):
 
 
 STRUCTURE = """\
-# Every run starts at rest on its reference as the loop closes: integrals and filtered speeds zero, the last reading the first.
-# At sample k, T = rate_s: speed and acceleration of a reference are its central differences; before the first sample it stands,
-# after the last it goes on along a line. Each axis:
+# Every run starts at rest on its reference as the loop closes: integrals and filtered speeds zero, the last reading the
+# first. At sample k, T = rate_s: speed and acceleration of a reference are its central differences; before the first
+# sample it stands, after the last it goes on along a line. Each axis:
 #   filtered += (1 - exp(-2 pi filter_hz T)) ((reading - last reading) / T - filtered)
 #   miss = reference speed + position_gain (reference - reading) - filtered;  integral += integral_gain T miss
 #   force = velocity_gain (miss + integral) + feed-forward, then cut at its limit
-# Micro first: reading = end_position, feed-forward = acceleration_feedforward a(reference) + spring_feedforward relative_reference.
-# Macro: its reference is reference - relative_reference; feed-forward = acceleration_feedforward a + velocity_feedforward v
-#   - spring_feedforward relative_reference + reaction_decoupling x micro command.
-# command in A = force / force constant of the gains table. It is held for T, acts command_delay later, and the current
+# Micro first: its reading is end_position, its feed-forward acceleration_feedforward a(reference)
+#   + spring_feedforward relative_reference.
+# Macro: its reference is reference - relative_reference, its feed-forward acceleration_feedforward a
+#   + velocity_feedforward v - spring_feedforward relative_reference + reaction_decoupling x micro command.
+# Command in A = force / force constant of the gains table. It is held for T, acts command_delay later, and the current
 # follows through a first-order lag current_lag. Reported currents are those at the sample.
-# Plant, r = end - macro, positive edges: spring_stiffness r + spring_damping r' pulls the macro forward and the end back;
-# stops: r > right_edge or r < -left_edge: stiffness x depth + contact_damping x rate of depth, never pulling.
+# Plant, r = end - macro: spring_stiffness r + spring_damping r' pulls the macro forward and the end back; stops beyond
+# r = right_edge and r = -left_edge: stiffness x depth + contact_damping x rate of depth, never pulling.
 # The micro drive pushes the end stage and, times micro_reaction, the macro axis backwards. macro_damping: to the base.
 """
 

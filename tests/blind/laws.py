@@ -381,9 +381,7 @@ def _turn(mem, v, x, dt):
     """mem: [direction, time since the last reversal, place of it]; a reversal needs 0.2 mm/s the other way."""
     if dt > 0.0:
         mem[1] += dt
-        if v * mem[0] < 0.0 and abs(v) > 2e-4:
-            mem[0], mem[1], mem[2] = math.copysign(1.0, v), 0.0, x
-        elif mem[0] == 0.0 and abs(v) > 2e-4:
+        if abs(v) > 2e-4 and v * mem[0] <= 0.0:
             mem[0], mem[1], mem[2] = math.copysign(1.0, v), 0.0, x
 
 
@@ -399,7 +397,7 @@ def smooth_force(code, p, mem, dt, t, x, v, r, drive, other, mass, micro):
         return -p[0] * v * (1.0 + p[1]) if v > 0.0 else -p[0] * v * (1.0 - p[1])
     if code == OFFSET:
         return p[0]
-    if code == DAHL or code == CABLE_HYSTERESIS:
+    if code in (DAHL, CABLE_HYSTERESIS):
         s = 1.0 if v > 0.0 else -1.0
         old = mem[0]
         new = s + (old - s) * math.exp(-abs(v) * dt / p[1])
@@ -515,8 +513,8 @@ def is_friction(code):
 def contact_force(code, p, mem, dt, t, r, speed, contact):
     """Force in N of the stops on the macro (its opposite on the end stage).
 
-    contact: [left stiffness, right stiffness, left edge, right edge, damping], edges as positive lengths. A spring and a
-    damper in parallel while the stops touch; never pulls.
+    contact: [left stiffness, right stiffness, left edge, right edge, damping], edges as positive lengths. A spring and
+    a damper in parallel while the stops touch; never pulls.
     """
     left, right = contact[2], contact[3]
     damping = contact[4]

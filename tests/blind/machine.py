@@ -64,7 +64,7 @@ CONTROL_STATE = 6  # macro: last reading, filtered speed, integral; micro: the s
 
 @njit(cache=True)
 def axis_law(gains, state, at, reference, speed, reading, first):
-    """Cascaded position and velocity loop: force in N before the feed-forward of acceleration. `at` is its first state."""
+    """Cascaded position and velocity loop: force in N before feed-forward. `at` is its first state."""
     kp, kv, ki, filter_hz = gains[0], gains[1], gains[2], gains[3]
     if first:
         state[at], state[at + 1], state[at + 2] = reading, 0.0, 0.0
@@ -78,7 +78,7 @@ def axis_law(gains, state, at, reference, speed, reading, first):
 
 @njit(cache=True)
 def control(c, state, reference, relative, y1, y2, first, single):
-    """Commands (macro, micro) in N. reference: end position, speed, acceleration; relative: the same of end minus macro."""
+    """Commands (macro, micro) in N. reference: position, speed, acceleration; relative: of end minus macro."""
     u2 = 0.0
     if not single:
         u2 = axis_law(c[7:11], state, 3, reference[0], reference[1], y2, first)
@@ -94,8 +94,8 @@ def control(c, state, reference, relative, y1, y2, first, single):
 @njit(cache=True)
 def loop_step(current, commands, k, s, delay, lag, dead):
     """A current loop over one step from s after sample k: (current at its end, its mean)."""
-    i0 = k + int(math.floor((s - delay) / SAMPLE_S + 1e-9))
-    i1 = k + int(math.floor((s + STEP_S - delay) / SAMPLE_S + 1e-9))
+    i0 = k + math.floor((s - delay) / SAMPLE_S + 1e-9)
+    i1 = k + math.floor((s + STEP_S - delay) / SAMPLE_S + 1e-9)
     old = dead_zone(dead, commands[i0]) if i0 >= 0 else 0.0
     if i0 == i1:
         e = math.exp(-STEP_S / lag)
@@ -114,7 +114,7 @@ def loop_step(current, commands, k, s, delay, lag, dead):
 def at_time(fine, start, filled, t):
     """Position at a time t >= 0 from the fine record, between its points on a line; before the start it stands."""
     place = t / STEP_S
-    i = int(math.floor(place))
+    i = math.floor(place)
     if i < 0:
         return start
     if i >= filled - 1:
@@ -126,11 +126,11 @@ def at_time(fine, start, filled, t):
 def simulate(base, payload, single, c, reference, relative, coloured, noise, t0, codes, places, p):
     """One run of the closed loop.
 
-    base: BASE; c: CONTROL; reference, relative: (n, 3); coloured: (n + 1, 2) N on each axis at the samples; noise: (n, 2) m
-    on each sensor; t0: session time at the start, for drift and wear; codes, places (0 macro, 1 end), p: the effects.
-    Returns samples (n, 8): readings, commands in N, currents, true positions; cells (n * CELLS, 8): x1, v1, x2, v2, drive 1, drive 2,
-    direction of dry friction on each axis; marks (effects, 2, n * CELLS): the force of each effect on each axis; and
-    (effects, n): the sensor error or the current that each effect makes.
+    base: BASE; c: CONTROL; reference, relative: (n, 3); coloured: (n + 1, 2) N on each axis at the samples;
+    noise: (n, 2) m on each sensor; t0: session time at the start, for drift and wear; codes, places (0 macro, 1 end), p: the effects.
+    Returns samples (n, 8): readings, commands in N, currents, true positions; cells (n * CELLS, 8): x1, v1, x2, v2,
+    drive 1, drive 2, direction of dry friction on each axis; marks (effects, 2, n * CELLS): the force of each effect on
+    each axis; and (effects, n): the sensor error or the current that each effect makes.
     """
     n = reference.shape[0]
     effects = len(codes)

@@ -2,9 +2,9 @@
 
     python -m tests.blind.score FINDINGS TRUTH      # folders of <seed>/findings.json and <seed>/truth.json
 
-Findings: {"verdict": "nothing" | "found" | "unknown", "effects": [{"name", "acts_on", "alias_set": [[name, acts_on], ...],
-"parameters": {}, "interval": {name: [low, high]}}], "parameter_errors": [{"name", "acts_on", "alias_set"}],
-"not_excited": [name, ...]}. Parameter names and units are those of the README's table.
+Findings: {"verdict": "nothing" | "found" | "unknown", "effects": [{"name", "acts_on", "alias_set":
+[[name, acts_on], ...], "parameters": {}, "interval": {name: [low, high]}}], "parameter_errors": [{"name", "acts_on",
+"alias_set"}], "not_excited": [name, ...]}. Parameter names and units are those of the README's table.
 """
 
 import argparse
@@ -86,11 +86,31 @@ def matched(findings, members, judged_aliases=True):
     return pairs
 
 
+def _respelled(findings, members):
+    """Findings with asymmetric Coulomb friction spelled as the truth has it: exactly Coulomb friction and an offset."""
+    result = list(findings)
+    present = {(member["name"], member["acts_on"]) for member in members}
+    for axis in ("macro_force", "micro_force"):
+        one = [found for found in result if (found["name"], found["acts_on"]) == ("asymmetric_coulomb_friction", axis)]
+        two = [
+            found for found in result if found["name"] in ("coulomb_friction", "offset") and found["acts_on"] == axis
+        ]
+        if one and {("coulomb_friction", axis), ("offset", axis)} <= present:
+            result.remove(one[0])
+            result += [{"name": name, "acts_on": axis} for name in ("coulomb_friction", "offset")]
+        elif {found["name"] for found in two} == {"coulomb_friction", "offset"} and (
+            ("asymmetric_coulomb_friction", axis) in present
+        ):
+            result = [found for found in result if not any(found is other for other in two)]
+            result.append({"name": "asymmetric_coulomb_friction", "acts_on": axis})
+    return result
+
+
 def score(findings, truth):
     """One set's mark: {"category", "right", "why", "pairs", "named"}."""
     if findings["verdict"] not in VERDICTS:
         raise ValueError(f"verdict {findings['verdict']!r} is none of {', '.join(VERDICTS)}")
-    effects, errors = findings.get("effects", []), findings.get("parameter_errors", [])
+    effects, errors = _respelled(findings.get("effects", []), truth["effects"]), findings.get("parameter_errors", [])
     where = category(truth)
     pairs = matched(effects, truth["effects"], where != "below_limit")
     why = ""
@@ -116,7 +136,7 @@ def score(findings, truth):
 
 
 def parameter_marks(pairs):
-    """[(relative error of the amplitude, whether its interval holds the truth or None)] of effects above ten times the limit."""
+    """[(relative error of the amplitude, whether its interval holds it or None)] above ten times the limit."""
     marks = []
     for found, member in pairs:
         name = member["amplitude"]
