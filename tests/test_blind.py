@@ -139,7 +139,7 @@ def test_a_command_is_held_delayed_and_lagged():
 # ---- each law's worked number ------------------------------------------------------------------------------------
 
 E1 = math.exp(-1.0)
-STATE = {"t": 0.0, "x": 0.0, "v": 0.0, "r": 0.0, "drive": 0.0, "other": 0.0, "mem": ()}
+STATE = {"t": 0.0, "x": 0.0, "v": 0.0, "drive": 0.0, "other": 0.0, "mem": ()}
 SMOOTH = [  # law, parameters, state, force in N
     ("viscous_friction", (5.0,), {"v": 0.2}, -1.0),
     ("asymmetric_viscous_friction", (5.0, 0.4), {"v": 0.2}, -1.4),
@@ -184,6 +184,7 @@ CONTACT = [  # law, parameters, r, speed, force on the macro with stops at -25 a
     ("soft_contact", (20e-6,), 186e-6, 0.0, 0.025),
     ("soft_contact", (20e-6,), 206e-6, 0.0, 0.2),
     ("contact_hysteresis", (0.2, 1e-6), -35e-6, 0.0, -0.12),
+    ("cubic_stiffness", (0.02,), 50e-6, 0.0, 0.0025),
 ]
 SENSOR = [  # law, parameters, x, error in m at 100 s
     ("scale_error", (1e-3,), 0.1, 1e-4),
@@ -219,11 +220,8 @@ def test_worked_force(name, p, state, force):
         s["t"],
         s["x"],
         s["v"],
-        s["r"],
-        s["drive"],
         s["other"],
         40.0,
-        False,
     )
     assert got == pytest.approx(force, rel=1e-6, abs=1e-12)
 
@@ -241,7 +239,7 @@ def test_worked_friction(name, p, state, direction, level):
 def test_worked_contact(name, p, r, speed, force):
     contact = np.array([1e4, 1e4, 25e-6, 176e-6, 100.0])
     mem = padded((1.0,), laws.MEMORIES)
-    got = laws.contact_force(laws.BY_NAME[name].code, padded(p), mem, 0.0, 1.0, r, speed, contact)
+    got = laws.contact_force(laws.BY_NAME[name].code_at("contact"), padded(p), mem, 0.0, 1.0, r, speed, contact)
     assert got == pytest.approx(force, rel=1e-9)
 
 

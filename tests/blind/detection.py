@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from tests.blind import laws, machine
 from tests.blind.draw import PARAMETER_ERRORS, SENSOR_QUANTUM_M, coloured_power, follows, simulate
-from tests.blind.laws import contact_force, friction_level, is_friction, smooth_force, thrust
+from tests.blind.laws import contact_force, friction_level, is_contact, is_friction, smooth_force, thrust
 from tests.blind.machine import CELLS, SAMPLE_S, STEPS, B
 
 D_PRIME_AT_LIMIT = 5.0
@@ -74,7 +74,7 @@ def along(code, place, p, cells, mass1, mass2, start, t0, contact):
         x1, v1, x2, v2, drive1, drive2 = cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3], cells[i, 4], cells[i, 5]
         t = (i + 0.5) * CELL_S
         r = x2 - x1
-        if 22 <= code <= 26:
+        if is_contact(code):
             f = contact_force(code, p, mem1, CELL_S, t0 + t, r, v2 - v1, contact)
             f -= contact_force(-1, empty, plain, 0.0, 0.0, r, v2 - v1, contact)
             out[0, i], out[1, i] = f, -f
@@ -88,9 +88,9 @@ def along(code, place, p, cells, mass1, mass2, start, t0, contact):
                 out[1, i] = -cells[i, 7] * friction_level(code, p, mem2, CELL_S, x2, v2, drive2, s)
             continue
         if place == 0 or both:
-            out[0, i] = smooth_force(code, p, mem1, CELL_S, t, x1, v1, r, drive1, drive2, mass1, False)
+            out[0, i] = smooth_force(code, p, mem1, CELL_S, t, x1, v1, drive2, mass1)
         if place == 1 or both:
-            out[1, i] = smooth_force(code, p, mem2, CELL_S, t, x2, v2, r, drive2, drive1, mass2, True)
+            out[1, i] = smooth_force(code, p, mem2, CELL_S, t, x2, v2, drive1, mass2)
     if code == 28:
         for i in range(1, n - 1):
             if place == 0:
@@ -289,7 +289,7 @@ class Evidence:
         if law.family == "sensor":
             return self._sensor_channels(run, place, self._reading_errors(run, law, place, p))
         forces = along(
-            law.code,
+            law.code_at(acts_on),
             place,
             p,
             run.cells,

@@ -232,9 +232,8 @@ def drawn_effect(rng, law, acts_on, homings, runs):
             values[parameter.name] = [float(rng.uniform(0, 2 * math.pi)) for _ in range(runs)]
         else:
             values[parameter.name] = parameter.drawn(rng)
-    if law.name == "cubic_stiffness":  # on the end stage it acts over 100 um, where the spring has 0.05 N
-        top = 0.1 if acts_on == "micro_force" else 5.0
-        low = 0.003 if acts_on == "micro_force" else 0.05
+    if law.name == "cubic_stiffness":  # between the stages it acts over 100 um, where the spring has 0.05 N
+        low, top = (0.003, 0.1) if acts_on == "contact" else (0.05, 5.0)
         values["force_at_reference_n"] = float(low * (top / low) ** rng.random())
     return Effect(law, acts_on, values)
 
@@ -245,7 +244,7 @@ def exclusive(effect):
         return "friction", effect.place
     if effect.law.family in ("actuator", "sensor"):
         return effect.law.family, effect.place
-    if effect.law.family == "contact":
+    if effect.acts_on == "contact":
         return ("contact",)
     return effect.law.name, effect.acts_on
 
@@ -283,7 +282,7 @@ def drawn_effects(rng, kind, single, homings, runs):
 def simulate(case, effects=None):
     """Runs of the case with these effects (its own where None): fresh Run objects, the same noise."""
     effects = case.effects if effects is None else effects
-    codes = np.array([effect.law.code for effect in effects], dtype=np.int64)
+    codes = np.array([effect.law.code_at(effect.acts_on) for effect in effects], dtype=np.int64)
     places = np.array([effect.place for effect in effects], dtype=np.int64)
     result = []
     for run in case.runs:

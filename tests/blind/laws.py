@@ -78,6 +78,10 @@ class Law:
     both_axes: bool = False  # moves both axes at once
     grid_counts: tuple = field(default=())  # points for each parameter after the amplitude, in a foreign fit
 
+    def code_at(self, acts_on):
+        """Its code at a place: cubic stiffness between the stages is a law of the contact."""
+        return BETWEEN_CUBIC if self.code == CUBIC and acts_on == "contact" else self.code
+
     def vector(self, values):
         """Parameters as the compiled code takes them."""
         p = np.zeros(PARAMETERS)
@@ -200,7 +204,7 @@ LAWS = (
     ),
     Law("tilt", 18, (MACRO,), (P("angle_rad", 0.03e-3, 2e-3, "sign"),), "force", signed=True, both_axes=True),
     Law("linear_stiffness", 19, (MACRO,), (P("stiffness_n_per_m", 0.5, 50.0),), "force", signed=True),
-    Law("cubic_stiffness", 20, EITHER_FORCE, (P("force_at_reference_n", 0.003, 5.0),), "force", signed=True),
+    Law("cubic_stiffness", 20, (MACRO, "contact"), (P("force_at_reference_n", 0.003, 5.0),), "force", signed=True),
     Law(
         "position_dependent_friction",
         21,
@@ -372,6 +376,7 @@ LAG, DELAY, DEAD_BAND, SENSOR_DELAY, SENSOR_LAG, SCALE, CYCLIC, DRIFT, ABBE, SKE
     38,
     39,
 )
+BETWEEN_CUBIC = 40
 SINCE_REVERSAL, ROOT_PERIODIC, ONE_WAY, DEAD_ZONE, ACCELERATION_SIGN = 101, 102, 103, 104, 105
 VELOCITY_PERIODIC, RINGING, SPEED_SINE, LAST_REVERSAL, BUMPS = 106, 107, 108, 109, 110
 
@@ -386,10 +391,10 @@ def _turn(mem, v, x, dt):
 
 
 @njit(cache=True)
-def smooth_force(code, p, mem, dt, t, x, v, r, drive, other, mass, micro):
-    """Force in N on an axis at x, v; `drive` its own drive force, `other` the other axis's, r = end minus macro.
+def smooth_force(code, p, mem, dt, t, x, v, other, mass):
+    """Force in N on an axis at x, v; `other`: the other axis's drive force.
 
-    `dt` > 0 advances the law's memory by that time, 0 leaves it. `micro` tells the end stage from the macro axis.
+    `dt` > 0 advances the law's memory by that time, 0 leaves it.
     """
     if code == VISCOUS:
         return -p[0] * v
@@ -428,7 +433,7 @@ def smooth_force(code, p, mem, dt, t, x, v, r, drive, other, mass, micro):
     if code == LINEAR_STIFFNESS:
         return -p[0] * x
     if code == CUBIC:
-        q = r / REFERENCE_DEPTH_M if micro else x / REFERENCE_LENGTH_M
+        q = x / REFERENCE_LENGTH_M
         return -p[0] * q * q * q
     if code == REACTION:
         return -p[0] * other
@@ -510,6 +515,12 @@ def is_friction(code):
 
 
 @njit(cache=True)
+def is_contact(code):
+    """Acts between the stages."""
+    return 22 <= code <= 26 or code == 40
+
+
+@njit(cache=True)
 def contact_force(code, p, mem, dt, t, r, speed, contact):
     """Force in N of the stops on the macro (its opposite on the end stage).
 
@@ -536,14 +547,17 @@ def contact_force(code, p, mem, dt, t, r, speed, contact):
             mem[0] = s + (mem[0] - s) * math.exp(-abs(inward) * dt / p[1])
         elif depth == 0.0:
             mem[0] = 1.0
+    between = 0.0
+    if code == BETWEEN_CUBIC:
+        between = p[0] * (r / REFERENCE_DEPTH_M) ** 3
     if depth == 0.0:
-        return 0.0
+        return between
     spring = stiffness * depth
     if code == SOFT:
         spring = stiffness * depth * depth / (2.0 * p[0]) if depth < p[0] else stiffness * (depth - 0.5 * p[0])
     elif code == CONTACT_HYSTERESIS:
         spring *= 1.0 + p[0] * mem[0]
-    return side * max(0.0, spring + damping * inward)
+    return between + side * max(0.0, spring + damping * inward)
 
 
 @njit(cache=True)

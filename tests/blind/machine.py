@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from tests.blind import laws
-from tests.blind.laws import contact_force, dead_zone, friction_level, is_friction, smooth_force, thrust
+from tests.blind.laws import contact_force, dead_zone, friction_level, is_contact, is_friction, smooth_force, thrust
 
 SAMPLE_S = 1e-3
 STEPS = 20  # a sample
@@ -127,7 +127,8 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
     """One run of the closed loop.
 
     base: BASE; c: CONTROL; reference, relative: (n, 3); coloured: (n + 1, 2) N on each axis at the samples;
-    noise: (n, 2) m on each sensor; t0: session time at the start, for drift and wear; codes, places (0 macro, 1 end), p: the effects.
+    noise: (n, 2) m on each sensor; t0: session time at the start, for drift and wear; codes, places (0 macro, 1 end),
+    p: the effects.
     Returns samples (n, 8): readings, commands in N, currents, true positions; cells (n * CELLS, 8): x1, v1, x2, v2,
     drive 1, drive 2, direction of dry friction on each axis; marks (effects, 2, n * CELLS): the force of each effect on
     each axis; and (effects, n): the sensor error or the current that each effect makes.
@@ -187,7 +188,7 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                 thrust1 = e
             else:
                 thrust2 = e
-        if 22 <= codes[e] <= 26:
+        if is_contact(codes[e]):
             contact_code = e
         if codes[e] == 34:
             lagged[e] = x1 if places[e] == 0 else x2
@@ -285,17 +286,17 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                     f2 -= between + touch
                 for e in range(effects):
                     code = codes[e]
-                    if is_friction(code) or (13 <= code <= 14) or (22 <= code <= 26) or (30 <= code <= 39):
+                    if is_friction(code) or is_contact(code) or (13 <= code <= 14) or (30 <= code <= 39):
                         continue
                     both = code == 18 or code == 29
                     dt = h if stage == 1 and code != 28 else 0.0
                     if places[e] == 0 or both:
-                        f = smooth_force(code, p[e], mem[e], dt, now, x1, w1, r, drive1, drive2, whole1, False)
+                        f = smooth_force(code, p[e], mem[e], dt, now, x1, w1, drive2, whole1)
                         f1 += f
                         if stage == 1:
                             marks[e, 0, cell] += f / CELL_STEPS
                     if (places[e] == 1 or both) and not single:
-                        f = smooth_force(code, p[e], mem[e], dt, now, x2, w2, r, drive2, drive1, whole2, True)
+                        f = smooth_force(code, p[e], mem[e], dt, now, x2, w2, drive1, whole2)
                         f2 += f
                         if stage == 1:
                             marks[e, 1, cell] += f / CELL_STEPS
@@ -336,10 +337,10 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                     # and it moves on with the speed that the axis now has
                     if places[e] == 0:
                         marks[e, 0, cell] += p[e, 0] * whole1 * (v1 - old1) / h / CELL_STEPS
-                        smooth_force(28, p[e], mem[e], h, now, x1, v1, 0.0, 0.0, 0.0, whole1, False)
+                        smooth_force(28, p[e], mem[e], h, now, x1, v1, 0.0, whole1)
                     else:
                         marks[e, 1, cell] += p[e, 0] * whole2 * (v2 - old2) / h / CELL_STEPS
-                        smooth_force(28, p[e], mem[e], h, now, x2, v2, 0.0, 0.0, 0.0, whole2, True)
+                        smooth_force(28, p[e], mem[e], h, now, x2, v2, 0.0, whole2)
             x1 += 0.5 * h * v1
             x2 += 0.5 * h * v2
             if single:
