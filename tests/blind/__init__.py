@@ -1,1 +1,1 @@
-"""Truth generator of the hidden-effect suite: it shares no code with what it judges and imports nothing of the project."""
+"""Truth generator of the hidden-effect suite: it shares no code with what it judges."""

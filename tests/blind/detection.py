@@ -1,14 +1,15 @@
 """What a perfect observer could see: detection limits, parameter errors, and which laws no likelihood ratio separates.
 
-Given the recorded positions and commands, the balance of each axis leaves `mass x acceleration - known forces`. A hidden
-effect adds its own force to it, a wrong base parameter adds its column, sensor noise and the coloured force make its
-spectrum; the recorded current minus the current that the command makes is a further channel. That is the closed loop's
-likelihood, written where its noise is stationary: whitening the closed loop's differences by the noise propagated through
-the loop gives the same numbers (`tests/test_blind.py` holds the two together).
+Given the recorded positions and commands, the balance of each axis leaves `mass x acceleration - known forces`. A
+hidden effect adds its own force to it, a wrong base parameter adds its column, sensor noise and the coloured force make
+its spectrum; the recorded current minus the current that the command makes is a further channel. That is the closed
+loop's likelihood, written where its noise is stationary: whitening the closed loop's differences by the noise
+propagated through the loop gives the same numbers (`tests/test_blind.py` holds the two together).
 """
 
+import copy
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -16,16 +17,17 @@ from scipy import fft, stats
 from scipy.interpolate import CubicSpline
 
 from tests.blind import laws, machine
-from tests.blind.draw import PARAMETER_ERRORS, SENSOR_QUANTUM_M, coloured_power, simulate
-from tests.blind.laws import contact_force, friction_level, is_friction, smooth_force, thrust
+from tests.blind.draw import PARAMETER_ERRORS, SENSOR_QUANTUM_M, coloured_power, follows, simulate
+from tests.blind.laws import contact_force, friction_level, is_contact, is_friction, smooth_force, thrust
 from tests.blind.machine import CELLS, SAMPLE_S, STEPS, B
 
 D_PRIME_AT_LIMIT = 5.0
+LIMIT_ROUNDS = 3
 FALSE_RATE = 0.05
 POWER = 0.9
 SEPARABLE_D = float(stats.norm.ppf(POWER) + stats.norm.ppf(1.0 - FALSE_RATE))  # 2.93: power 0.9 at 5 % false
 TAPER_S = 1.0
-SEPARATION_BAND_HZ = 150.0  # laws are told apart below this: it costs a cyclic error some, everything else nothing
+SEPARATION_BAND_HZ = 150.0  # laws are told apart below this: only a cyclic error has much above it
 CELL_S = SAMPLE_S / CELLS
 # a cell's weight in the force that the second difference of positions sees: a triangle of one sample to either side
 _UP = (np.arange(CELLS) + 0.5) / CELLS / CELLS
@@ -72,7 +74,7 @@ def along(code, place, p, cells, mass1, mass2, start, t0, contact):
         x1, v1, x2, v2, drive1, drive2 = cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3], cells[i, 4], cells[i, 5]
         t = (i + 0.5) * CELL_S
         r = x2 - x1
-        if 22 <= code <= 26:
+        if is_contact(code):
             f = contact_force(code, p, mem1, CELL_S, t0 + t, r, v2 - v1, contact)
             f -= contact_force(-1, empty, plain, 0.0, 0.0, r, v2 - v1, contact)
             out[0, i], out[1, i] = f, -f
@@ -86,9 +88,9 @@ def along(code, place, p, cells, mass1, mass2, start, t0, contact):
                 out[1, i] = -cells[i, 7] * friction_level(code, p, mem2, CELL_S, x2, v2, drive2, s)
             continue
         if place == 0 or both:
-            out[0, i] = smooth_force(code, p, mem1, CELL_S, t, x1, v1, r, drive1, drive2, mass1, False)
+            out[0, i] = smooth_force(code, p, mem1, CELL_S, t, x1, v1, drive2, mass1)
         if place == 1 or both:
-            out[1, i] = smooth_force(code, p, mem2, CELL_S, t, x2, v2, r, drive2, drive1, mass2, True)
+            out[1, i] = smooth_force(code, p, mem2, CELL_S, t, x2, v2, drive1, mass2)
     if code == 28:
         for i in range(1, n - 1):
             if place == 0:
@@ -102,8 +104,9 @@ class Evidence:
     """The whitened record of a simulated case: what base parameters and effects would add to it."""
 
     def __init__(self, case, runs, band_hz=0.5 / SAMPLE_S):
-        """`runs`: the case simulated with the effects along which everything is judged; above `band_hz` nothing counts."""
+        """`runs`: simulated with the effects along which everything is judged; above `band_hz` nothing counts."""
         self.case, self.runs, self.band_hz = case, runs, band_hz
+        self._plain = {}
         self.base = case.base
         self.gains = [self._whitening(run) for run in runs]
         self.contact = np.array([case.base[i] for i in range(6, 11)])
@@ -114,7 +117,7 @@ class Evidence:
     # ---- whitening ----
 
     def _whitening(self, run):
-        """Factors on the spectrum of each channel (two forces, two currents; None where there is none), and the taper."""
+        """(factors on the spectrum of each channel: two forces, two currents, None where absent; taper; FFT length)."""
         m = len(run.samples) - 2
         length = fft.next_fast_len(m, real=True)
         f = np.fft.rfftfreq(length, SAMPLE_S)
@@ -135,6 +138,22 @@ class Evidence:
             gains[1] = gains[3] = None
         ramp = np.minimum(np.arange(m) * SAMPLE_S, np.arange(m)[::-1] * SAMPLE_S) / min(TAPER_S, 0.1 * m * SAMPLE_S)
         return gains, np.sin(0.5 * math.pi * np.minimum(ramp, 1.0)) ** 2, length
+
+    def narrowed(self, band_hz):
+        """The same evidence with nothing above `band_hz`."""
+        other = copy.copy(self)
+        other.band_hz = band_hz
+        other.gains = [other._whitening(run) for run in self.runs]
+        keep = []
+        for wide, narrow in zip(self.gains, other.gains, strict=True):
+            for i in range(4):
+                if wide[0][i] is not None:
+                    one = np.arange(len(wide[0][i])) < len(narrow[0][i])
+                    keep += [one, one]
+        keep = np.concatenate(keep)
+        other.base_columns = {name: column[keep] for name, column in self.base_columns.items()}
+        other.set_nuisance()
+        return other
 
     def _mass(self, run, place):
         payload_here = self.case.single == (place == 0)
@@ -175,7 +194,9 @@ class Evidence:
         """What a current loop slower by these makes."""
         commands = self._commands(run, place)
         d, tau = self.base[B["macro_command_delay_s"] + place], self.base[B["macro_current_lag_s"] + place]
-        plain = actuator(commands, d, tau, 0.0)
+        if (run.number, place) not in self._plain:
+            self._plain[run.number, place] = actuator(commands, d, tau, 0.0)
+        plain = self._plain[run.number, place]
         other = actuator(commands, d + delay, tau + lag, dead)
         constant = self.base[B["macro_force_constant_n_per_a"] + place]
         return self._drive_channels(run, place, constant * (other[0] - plain[0]), other[1] - plain[1])
@@ -262,11 +283,13 @@ class Evidence:
             x = run.cells[:, 2 * place]
             constant = self.base[B["macro_force_constant_n_per_a"] + place]
             plain = run.cells[:, 4 + place]
-            return self._drive_channels(run, place, _thrust_along(law.code, p, constant, plain / constant, x) - plain, None)
+            return self._drive_channels(
+                run, place, _thrust_along(law.code, p, constant, plain / constant, x) - plain, None
+            )
         if law.family == "sensor":
             return self._sensor_channels(run, place, self._reading_errors(run, law, place, p))
         forces = along(
-            law.code,
+            law.code_at(acts_on),
             place,
             p,
             run.cells,
@@ -298,19 +321,21 @@ class Evidence:
     # ---- statistics ----
 
     def set_nuisance(self, free=(), without=()):
-        """Base parameters (but `without`) within their uncertainty, and `free` columns of any size, are projected out."""
+        """Projects out the base parameters but `without` within their uncertainty, and `free` columns of any size."""
         columns = [self.base_columns[name] * self.case.uncertainty[name] for name in self.names if name not in without]
         for column in free:
             norm = np.linalg.norm(column)
             if norm > 0.0:
                 columns.append(column * (1e6 / norm))
         rows = np.array(columns)
-        root = np.linalg.cholesky(rows @ rows.T + np.eye(len(rows)))
-        self._nuisance = np.linalg.solve(root, rows)
+        root = np.linalg.cholesky(_products(rows, rows) + np.eye(len(rows)))
+        self._nuisance = np.einsum("ij,jk->ik", np.linalg.inv(root), rows)
 
     def inner(self, a, b):
         """Scalar product of two whitened vectors after the nuisances are projected out."""
-        return float(a @ b - (self._nuisance @ a) @ (self._nuisance @ b))
+        pair = np.array([a, b])
+        seen = _products(pair, self._nuisance)
+        return float(np.einsum("i,i", a, b) - seen[0] @ seen[1])
 
     def d_prime(self, column, others=()):
         """Detectability of a column, given that the base is known within its uncertainty and `others` not at all."""
@@ -330,9 +355,9 @@ class Evidence:
         if not columns:
             return math.sqrt(max(whole, 0.0))
         raw = np.array(columns)
-        seen = raw @ self._nuisance.T
-        gram = raw @ raw.T - seen @ seen.T
-        target = raw @ signal - seen @ (self._nuisance @ signal)
+        seen = _products(raw, self._nuisance)
+        gram = _products(raw, raw) - seen @ seen.T
+        target = (_products(raw, signal[None]) - seen @ _products(self._nuisance, signal[None]))[:, 0]
         if len(columns) == 1 and not signed and target[0] <= 0.0:
             return math.sqrt(max(whole, 0.0))
         scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -342,7 +367,7 @@ class Evidence:
     # ---- alternatives ----
 
     def alternatives(self, hints=()):
-        """Every library law at every place this stage has, over a grid of its parameters: (name, acts_on, signed, columns).
+        """Every library law at every place, over a grid of its parameters: (name, acts_on, signed, columns).
 
         hints: effects whose pitches and frequencies join the grids of the periodic laws.
         """
@@ -408,6 +433,11 @@ class Evidence:
         return nearest
 
 
+def _products(a, b):
+    """Scalar products of rows: by einsum, as threaded matrix products of this shape cost ten times more."""
+    return np.einsum("ik,jk->ij", a, b)
+
+
 @njit(cache=True)
 def _contact_along(cells, contact):
     empty, mem = np.zeros(laws.PARAMETERS), np.zeros(laws.MEMORIES)
@@ -465,26 +495,29 @@ def amplitude(effect):
 def limit_of(case, evidence, index, columns):
     """(d', limit): d' of effect `index` given the others, and the amplitude where it would be 5.
 
-    The first guess takes d' as proportional; where it lies within a factor of 8 the case is simulated there and the limit
-    interpolated between the two.
+    d' isn't proportional to the amplitude where the loop's answer to the effect is itself uncertain, so the case is
+    simulated again near the limit, at most three times.
     """
-    others = [column for i, column in enumerate(columns) if i != index]
-    own = evidence.d_prime(columns[index], others)
+    own = evidence.d_prime(columns[index], [column for i, column in enumerate(columns) if i != index])
     size = amplitude(case.effects[index])
     if own <= 0.0:
         return 0.0, math.inf
-    limit = size * D_PRIME_AT_LIMIT / own
-    if len(case.effects) == 1 and 1.0 / 8.0 < limit / size < 8.0 and not 0.8 < limit / size < 1.25:
-        there = [case.effects[index].scaled(limit / size)]
-        runs = simulate(case, there)
-        if all(np.all(np.isfinite(run.samples)) for run in runs):
-            other = Evidence(case, runs)
-            probe = other.d_prime(other.effect_column(0))
-            if probe > 0.0 and abs(math.log(own / probe)) > 0.05:
-                slope = math.log(size / limit) / math.log(own / probe)
-                slope = min(max(slope, 0.3), 3.0)
-                limit *= (D_PRIME_AT_LIMIT / probe) ** slope
-    return own, limit
+    scale, probe = 1.0, own
+    for _ in range(LIMIT_ROUNDS):
+        if abs(math.log(probe / D_PRIME_AT_LIMIT)) < 0.1:
+            break
+        scale *= min(max(D_PRIME_AT_LIMIT / probe, 1.0 / 30.0), 30.0)
+        effects = [effect.scaled(scale) if i == index else effect for i, effect in enumerate(case.effects)]
+        there = replace(case, effects=effects)
+        runs = simulate(there)
+        if not follows(runs):
+            return own, size * scale  # it would be seen long before the loop fails
+        other = Evidence(there, runs)
+        marks = [other.effect_column(i) for i in range(len(effects))]
+        probe = other.d_prime(marks[index], [mark for i, mark in enumerate(marks) if i != index])
+        if probe <= 0.0:
+            return own, math.inf
+    return own, size * scale * D_PRIME_AT_LIMIT / probe
 
 
 def judged(case, separate=True):
@@ -500,8 +533,8 @@ def judged(case, separate=True):
         evidence.set_nuisance(others, PARAMETER_ERRORS[key])
         column = evidence.parameter_column(key)
         units[key] = math.sqrt(max(evidence.inner(column, column), 0.0))
+    narrow = evidence.narrowed(SEPARATION_BAND_HZ) if separate else None
     del evidence
-    narrow = Evidence(case, case.runs, SEPARATION_BAND_HZ) if separate else None
     columns = [narrow.effect_column(i) for i in range(len(case.effects))] if separate else []
     found = []
     for index, (effect, (own, limit)) in enumerate(zip(case.effects, limits, strict=True)):

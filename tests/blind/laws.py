@@ -78,6 +78,10 @@ class Law:
     both_axes: bool = False  # moves both axes at once
     grid_counts: tuple = field(default=())  # points for each parameter after the amplitude, in a foreign fit
 
+    def code_at(self, acts_on):
+        """Its code at a place: cubic stiffness between the stages is a law of the contact."""
+        return BETWEEN_CUBIC if self.code == CUBIC and acts_on == "contact" else self.code
+
     def vector(self, values):
         """Parameters as the compiled code takes them."""
         p = np.zeros(PARAMETERS)
@@ -200,7 +204,7 @@ LAWS = (
     ),
     Law("tilt", 18, (MACRO,), (P("angle_rad", 0.03e-3, 2e-3, "sign"),), "force", signed=True, both_axes=True),
     Law("linear_stiffness", 19, (MACRO,), (P("stiffness_n_per_m", 0.5, 50.0),), "force", signed=True),
-    Law("cubic_stiffness", 20, EITHER_FORCE, (P("force_at_reference_n", 0.003, 5.0),), "force", signed=True),
+    Law("cubic_stiffness", 20, (MACRO, "contact"), (P("force_at_reference_n", 0.003, 5.0),), "force", signed=True),
     Law(
         "position_dependent_friction",
         21,
@@ -360,7 +364,19 @@ VISCOUS, ASYMMETRIC_VISCOUS, COULOMB, ASYMMETRIC_COULOMB, OFFSET, STRIBECK, SUBL
 DAHL, LUGRE, LOAD_DEPENDENT, QUADRATIC, COGGING, RIPPLE, SATURATION = 8, 9, 10, 11, 12, 13, 14
 CABLE_SPRING, CABLE_HYSTERESIS, TILT, LINEAR_STIFFNESS, CUBIC, POSITION_FRICTION = 16, 17, 18, 19, 20, 21
 CENTRE, WEAR, CONTACT_DAMPING, SOFT, CONTACT_HYSTERESIS, REACTION, FLEXIBLE, VIBRATION = 22, 23, 24, 25, 26, 27, 28, 29
-LAG, DELAY, DEAD_BAND, SENSOR_DELAY, SENSOR_LAG, SCALE, CYCLIC, DRIFT, ABBE, SKEW = 30, 31, 32, 33, 34, 35, 36, 37, 38, 39
+LAG, DELAY, DEAD_BAND, SENSOR_DELAY, SENSOR_LAG, SCALE, CYCLIC, DRIFT, ABBE, SKEW = (
+    30,
+    31,
+    32,
+    33,
+    34,
+    35,
+    36,
+    37,
+    38,
+    39,
+)
+BETWEEN_CUBIC = 40
 SINCE_REVERSAL, ROOT_PERIODIC, ONE_WAY, DEAD_ZONE, ACCELERATION_SIGN = 101, 102, 103, 104, 105
 VELOCITY_PERIODIC, RINGING, SPEED_SINE, LAST_REVERSAL, BUMPS = 106, 107, 108, 109, 110
 
@@ -370,17 +386,15 @@ def _turn(mem, v, x, dt):
     """mem: [direction, time since the last reversal, place of it]; a reversal needs 0.2 mm/s the other way."""
     if dt > 0.0:
         mem[1] += dt
-        if v * mem[0] < 0.0 and abs(v) > 2e-4:
-            mem[0], mem[1], mem[2] = math.copysign(1.0, v), 0.0, x
-        elif mem[0] == 0.0 and abs(v) > 2e-4:
+        if abs(v) > 2e-4 and v * mem[0] <= 0.0:
             mem[0], mem[1], mem[2] = math.copysign(1.0, v), 0.0, x
 
 
 @njit(cache=True)
-def smooth_force(code, p, mem, dt, t, x, v, r, drive, other, mass, micro):
-    """Force in N on an axis at x, v; `drive` its own drive force, `other` the other axis's, r = end minus macro.
+def smooth_force(code, p, mem, dt, t, x, v, other, mass):
+    """Force in N on an axis at x, v; `other`: the other axis's drive force.
 
-    `dt` > 0 advances the law's memory by that time, 0 leaves it. `micro` tells the end stage from the macro axis.
+    `dt` > 0 advances the law's memory by that time, 0 leaves it.
     """
     if code == VISCOUS:
         return -p[0] * v
@@ -388,7 +402,7 @@ def smooth_force(code, p, mem, dt, t, x, v, r, drive, other, mass, micro):
         return -p[0] * v * (1.0 + p[1]) if v > 0.0 else -p[0] * v * (1.0 - p[1])
     if code == OFFSET:
         return p[0]
-    if code == DAHL or code == CABLE_HYSTERESIS:
+    if code in (DAHL, CABLE_HYSTERESIS):
         s = 1.0 if v > 0.0 else -1.0
         old = mem[0]
         new = s + (old - s) * math.exp(-abs(v) * dt / p[1])
@@ -419,7 +433,7 @@ def smooth_force(code, p, mem, dt, t, x, v, r, drive, other, mass, micro):
     if code == LINEAR_STIFFNESS:
         return -p[0] * x
     if code == CUBIC:
-        q = r / REFERENCE_DEPTH_M if micro else x / REFERENCE_LENGTH_M
+        q = x / REFERENCE_LENGTH_M
         return -p[0] * q * q * q
     if code == REACTION:
         return -p[0] * other
@@ -434,8 +448,8 @@ def smooth_force(code, p, mem, dt, t, x, v, r, drive, other, mass, micro):
             c, s = math.cos(wd * dt), math.sin(wd * dt)
             q = e * (stretch * c + (speed + d * stretch) / wd * s)
             qd = e * (speed * c - (d * speed + w * w * stretch) / wd * s)
+            # mem belongs to the middle of a step, where x is: the force is that of before it moves on
             mem[0], mem[1] = x + v * dt + q, v + qd
-            stretch, speed = 0.5 * (stretch + q), 0.5 * (speed + qd)
         return attached * (w * w * stretch + 2.0 * p[2] * w * speed)
     if code == VIBRATION:
         return -mass * p[0] * math.sin(2.0 * math.pi * p[1] * t + p[2])
@@ -501,11 +515,17 @@ def is_friction(code):
 
 
 @njit(cache=True)
+def is_contact(code):
+    """Acts between the stages."""
+    return 22 <= code <= 26 or code == 40
+
+
+@njit(cache=True)
 def contact_force(code, p, mem, dt, t, r, speed, contact):
     """Force in N of the stops on the macro (its opposite on the end stage).
 
-    contact: [left stiffness, right stiffness, left edge, right edge, damping], edges as positive lengths. A spring and a
-    damper in parallel while the stops touch; never pulls.
+    contact: [left stiffness, right stiffness, left edge, right edge, damping], edges as positive lengths. A spring and
+    a damper in parallel while the stops touch; never pulls.
     """
     left, right = contact[2], contact[3]
     damping = contact[4]
@@ -527,14 +547,17 @@ def contact_force(code, p, mem, dt, t, r, speed, contact):
             mem[0] = s + (mem[0] - s) * math.exp(-abs(inward) * dt / p[1])
         elif depth == 0.0:
             mem[0] = 1.0
+    between = 0.0
+    if code == BETWEEN_CUBIC:
+        between = p[0] * (r / REFERENCE_DEPTH_M) ** 3
     if depth == 0.0:
-        return 0.0
+        return between
     spring = stiffness * depth
     if code == SOFT:
         spring = stiffness * depth * depth / (2.0 * p[0]) if depth < p[0] else stiffness * (depth - 0.5 * p[0])
     elif code == CONTACT_HYSTERESIS:
         spring *= 1.0 + p[0] * mem[0]
-    return side * max(0.0, spring + damping * inward)
+    return between + side * max(0.0, spring + damping * inward)
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from tests.blind import laws
-from tests.blind.laws import contact_force, dead_zone, friction_level, is_friction, smooth_force, thrust
+from tests.blind.laws import contact_force, dead_zone, friction_level, is_contact, is_friction, smooth_force, thrust
 
 SAMPLE_S = 1e-3
 STEPS = 20  # a sample
@@ -64,7 +64,7 @@ CONTROL_STATE = 6  # macro: last reading, filtered speed, integral; micro: the s
 
 @njit(cache=True)
 def axis_law(gains, state, at, reference, speed, reading, first):
-    """Cascaded position and velocity loop: force in N before the feed-forward of acceleration. `at` is its first state."""
+    """Cascaded position and velocity loop: force in N before feed-forward. `at` is its first state."""
     kp, kv, ki, filter_hz = gains[0], gains[1], gains[2], gains[3]
     if first:
         state[at], state[at + 1], state[at + 2] = reading, 0.0, 0.0
@@ -78,7 +78,7 @@ def axis_law(gains, state, at, reference, speed, reading, first):
 
 @njit(cache=True)
 def control(c, state, reference, relative, y1, y2, first, single):
-    """Commands (macro, micro) in N. reference: end position, speed, acceleration; relative: the same of end minus macro."""
+    """Commands (macro, micro) in N. reference: position, speed, acceleration; relative: of end minus macro."""
     u2 = 0.0
     if not single:
         u2 = axis_law(c[7:11], state, 3, reference[0], reference[1], y2, first)
@@ -94,8 +94,8 @@ def control(c, state, reference, relative, y1, y2, first, single):
 @njit(cache=True)
 def loop_step(current, commands, k, s, delay, lag, dead):
     """A current loop over one step from s after sample k: (current at its end, its mean)."""
-    i0 = k + int(math.floor((s - delay) / SAMPLE_S + 1e-9))
-    i1 = k + int(math.floor((s + STEP_S - delay) / SAMPLE_S + 1e-9))
+    i0 = k + math.floor((s - delay) / SAMPLE_S + 1e-9)
+    i1 = k + math.floor((s + STEP_S - delay) / SAMPLE_S + 1e-9)
     old = dead_zone(dead, commands[i0]) if i0 >= 0 else 0.0
     if i0 == i1:
         e = math.exp(-STEP_S / lag)
@@ -114,7 +114,7 @@ def loop_step(current, commands, k, s, delay, lag, dead):
 def at_time(fine, start, filled, t):
     """Position at a time t >= 0 from the fine record, between its points on a line; before the start it stands."""
     place = t / STEP_S
-    i = int(math.floor(place))
+    i = math.floor(place)
     if i < 0:
         return start
     if i >= filled - 1:
@@ -126,11 +126,12 @@ def at_time(fine, start, filled, t):
 def simulate(base, payload, single, c, reference, relative, coloured, noise, t0, codes, places, p):
     """One run of the closed loop.
 
-    base: BASE; c: CONTROL; reference, relative: (n, 3); coloured: (n + 1, 2) N on each axis at the samples; noise: (n, 2) m
-    on each sensor; t0: session time at the start, for drift and wear; codes, places (0 macro, 1 end), p: the effects.
-    Returns samples (n, 8): readings, commands in N, currents, true positions; cells (n * CELLS, 8): x1, v1, x2, v2, drive 1, drive 2,
-    direction of dry friction on each axis; marks (effects, 2, n * CELLS): the force of each effect on each axis; and
-    (effects, n): the sensor error or the current that each effect makes.
+    base: BASE; c: CONTROL; reference, relative: (n, 3); coloured: (n + 1, 2) N on each axis at the samples;
+    noise: (n, 2) m on each sensor; t0: session time at the start, for drift and wear; codes, places (0 macro, 1 end),
+    p: the effects.
+    Returns samples (n, 8): readings, commands in N, currents, true positions; cells (n * CELLS, 8): x1, v1, x2, v2,
+    drive 1, drive 2, direction of dry friction on each axis; marks (effects, 2, n * CELLS): the force of each effect on
+    each axis; and (effects, n): the sensor error or the current that each effect makes.
     """
     n = reference.shape[0]
     effects = len(codes)
@@ -144,6 +145,8 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
     lagged = np.zeros(effects)
     state = np.zeros(CONTROL_STATE)
     x1, x2 = reference[0, 0] - relative[0, 0], reference[0, 0]
+    if single:
+        x2 = 0.0
     v1, v2 = 0.0, 0.0
     fine1[0], fine2[0] = x1, x2
     m1, m2 = base[0], base[1] + payload
@@ -185,7 +188,7 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                 thrust1 = e
             else:
                 thrust2 = e
-        if 22 <= codes[e] <= 26:
+        if is_contact(codes[e]):
             contact_code = e
         if codes[e] == 34:
             lagged[e] = x1 if places[e] == 0 else x2
@@ -283,16 +286,17 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                     f2 -= between + touch
                 for e in range(effects):
                     code = codes[e]
-                    if is_friction(code) or (13 <= code <= 14) or (22 <= code <= 26) or (30 <= code <= 39):
+                    if is_friction(code) or is_contact(code) or (13 <= code <= 14) or (30 <= code <= 39):
                         continue
                     both = code == 18 or code == 29
+                    dt = h if stage == 1 and code != 28 else 0.0
                     if places[e] == 0 or both:
-                        f = smooth_force(code, p[e], mem[e], dt, now, x1, w1, r, drive1, drive2, whole1, False)
+                        f = smooth_force(code, p[e], mem[e], dt, now, x1, w1, drive2, whole1)
                         f1 += f
                         if stage == 1:
                             marks[e, 0, cell] += f / CELL_STEPS
                     if (places[e] == 1 or both) and not single:
-                        f = smooth_force(code, p[e], mem[e], dt, now, x2, w2, r, drive2, drive1, whole2, True)
+                        f = smooth_force(code, p[e], mem[e], dt, now, x2, w2, drive1, whole2)
                         f2 += f
                         if stage == 1:
                             marks[e, 1, cell] += f / CELL_STEPS
@@ -330,10 +334,13 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                         f = friction_level(codes[e], p[e], mem[e], 0.0, x2, v2, drive2, math.copysign(1.0, direction2))
                         marks[e, 1, cell] -= direction2 * f / CELL_STEPS
                 elif codes[e] == 28:  # the attached body's own inertia is missing from a rigid axis
+                    # and it moves on with the speed that the axis now has
                     if places[e] == 0:
                         marks[e, 0, cell] += p[e, 0] * whole1 * (v1 - old1) / h / CELL_STEPS
+                        smooth_force(28, p[e], mem[e], h, now, x1, v1, 0.0, whole1)
                     else:
                         marks[e, 1, cell] += p[e, 0] * whole2 * (v2 - old2) / h / CELL_STEPS
+                        smooth_force(28, p[e], mem[e], h, now, x2, v2, 0.0, whole2)
             x1 += 0.5 * h * v1
             x2 += 0.5 * h * v2
             if single:
@@ -347,9 +354,9 @@ def simulate(base, payload, single, c, reference, relative, coloured, noise, t0,
                     target = fine[place] - slope * p[e, 0]  # a lag follows a ramp at this distance
                     before = fine[place - 1] - slope * p[e, 0]
                     lagged[e] = target + (lagged[e] - before) * math.exp(-h / p[e, 0])
-            cells[cell, 0] += x1 / CELL_STEPS
+            cells[cell, 0] += 0.5 * (fine1[place - 1] + x1) / CELL_STEPS
             cells[cell, 1] += 0.5 * (old1 + v1) / CELL_STEPS
-            cells[cell, 2] += x2 / CELL_STEPS
+            cells[cell, 2] += 0.5 * (fine2[place - 1] + x2) / CELL_STEPS
             cells[cell, 3] += 0.5 * (old2 + v2) / CELL_STEPS
             cells[cell, 4] += drive1 / CELL_STEPS
             cells[cell, 5] += drive2 / CELL_STEPS

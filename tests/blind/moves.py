@@ -19,7 +19,7 @@ def smoothed(path, lengths):
 
 
 def with_derivatives(path):
-    """(n, 3): position, speed, acceleration by central differences; it stands before its start and goes on at its end."""
+    """(n, 3): position, speed, acceleration by central differences; it stands before its start, goes on after it."""
     padded = np.concatenate([[path[0]], path, [2.0 * path[-1] - path[-2]]])
     speed = (padded[2:] - padded[:-2]) / (2.0 * SAMPLE_S)
     acceleration = (padded[2:] - 2.0 * padded[1:-1] + padded[:-2]) / SAMPLE_S**2
