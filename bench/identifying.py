@@ -19,7 +19,7 @@ class Identified:
     """Errors of one identification; shares are magnitudes relative to the truth."""
 
     seed: int
-    frequency_hz: float
+    frequency_hz: float | None  # None: what suits the joint
     left_stiffness_share: float
     right_stiffness_share: float
     width_share: float
@@ -38,7 +38,13 @@ class Identified:
 
 
 def identify(
-    profile: Profile, machine: Machine, seed: int, frequency_hz: float, duration_s: float, folder: Path, tick_s: float
+    profile: Profile,
+    machine: Machine,
+    seed: int,
+    frequency_hz: float | None,
+    duration_s: float,
+    folder: Path,
+    tick_s: float,
 ) -> Identified:
     """Home, sweep the micro over both edges in closed loop, compare; RequestError where the sweep ends early."""
     backend = BatchBackend(machine, seed=seed, tick_s=tick_s)
@@ -50,7 +56,7 @@ def identify(
         outcome = stage.identify(frequency_hz, duration_s)
     found, joint = outcome.backlash, machine.backlash
     if not outcome.finished or found is None or joint is None or not found.identifiable:
-        raise RequestError(f"seed {seed}, {frequency_hz:g} Hz: nothing was identified: {outcome.text}")
+        raise RequestError(f"seed {seed}, {frequency_hz or 'own'} Hz: nothing was identified: {outcome.text}")
     run, truth = read_run(folder), backend.truth()
     scored = score(run, truth, outcome.first_row, outcome.rows)
     place = np.searchsorted(truth["sequence"], scored.rows["cycle"])

@@ -52,6 +52,7 @@ def compare(
         state = np.zeros(1, PLANT_STATE)
         for name, value in backend.rig.plant_state().items():
             state[name] = value
+        state["memory"] = backend.rig.effects_memory()
         controller_state = backend.servo.tracker.active.snapshot()
         first_sample = int(controller_state["estimator"]["cycle"][0]) + 1
         held_a = [float(node.drive.servo["torque_target_a"][0]) for node in backend.rig.nodes]

@@ -4,6 +4,8 @@ Every object is written and read back; what differs refuses to arm. The codecs c
 that was read back, never from the one that was asked for. Knows no bus: it speaks through a master.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -36,6 +38,24 @@ _MAPPING_INPUTS = (0x60FD_00_20,)
 
 _MODES = {"torque": cia402.MODE_CST, "position": cia402.MODE_CSP}
 _ENERGISED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia402.State.FAULT_REACTION_ACTIVE)
+_IDENTITY_NAMES = ("vendor id", "product code", "revision number", "serial number")  # 0x1018:01 .. :04
+_REST_M_PER_S = 1e-3  # slower than this is standstill
+_REST_WINDOW_S = 0.1  # between two looks at the encoder: 100 um at that speed, a thousand counts of 100 nm
+_LEAVE_TIMEOUT_S = 0.5  # for Disable voltage
+_LEAVE_STEP_S = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class StaleTorque:
+    """How far a torque that nobody renews may push a drive that has no RPDO deadline, SI.
+
+    Until the drive misses the heartbeat, t after the last command, it keeps up the last torque: from rest that moves
+    the axes against each other by F t^2 / (2 m). The joint, spring and damping only make it less.
+    """
+
+    mass_kg: float  # m: what F accelerates as seen from the other axis
+    way_m: float  # that it may use up
+    needed_n: float  # the least limit with which the profile's motion can be done
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +64,7 @@ class DriveSettings:
 
     node_id: int
     eds_path: str
-    identity: tuple[int, int | None]  # vendor id that the opened backend demands, product code or None = any of it
+    identity: tuple[int | None, ...]  # 0x1018:01 .. :04, vendor first; None, and what is left out, may be anything
     mode: Literal["torque", "position"]  # CST, or CSP with torque offset
     rated_torque_word: int  # 0x6076, 1e-3 N
     max_torque_word: int  # 0x6072, 0.1 % of rated
@@ -52,7 +72,10 @@ class DriveSettings:
     quick_stop_option: int  # 0x605A
     heartbeat_ms: int  # the servo's heartbeat is missed after this; the drive sends its own four times as often
     servo_node_id: int = 0x7E
-    rpdo_deadline_ms: int = 10  # 0x1400:05; 0 = the drive has none, and the caller caps the torque instead
+    rpdo_deadline_ms: int = 10  # 0x1400:05
+    stale_torque: StaleTorque | None = (
+        None  # caps the torque of a drive without 0x1400:05; None = such a one is refused
+    )
     cycle_us: int = 1000
     inputs_inhibit_us: int = 2000  # TPDO2 at most this often: a bouncing switch must not fill the bus, nor a trip wait
     rated_current_word: int | None = None  # 0x6075, mA; None = not compared
@@ -82,25 +105,32 @@ class DriveMapping:
     emcy_id: int
 
 
-def configure(master: "Master", drives: list[DriveSettings]) -> list[DriveMapping]:
+def configure(
+    master: "Master", drives: list[DriveSettings], remark: Callable[[str], None] = lambda text: None
+) -> list[DriveMapping]:
     """Check and configure all drives, leave them in NMT pre-operational, return what was read back.
 
-    Nothing is written before every drive has shown the right identity and stands without power.
+    Nothing is written before every drive has shown the right identity and stands without power, or held by a quick
+    stop that a former run left: that one is ended first. `remark` is called with what the operator should know.
     DriveError names object, wrote, read and remedy; LinkError where a drive is silent.
     """
     _check_settings(drives)
     for drive in drives:
         master.add_node(drive.node_id, drive.eds_path)
         _check_identity(master, drive)
+    held: list[DriveSettings] = []
     for drive in drives:
-        _check_at_rest(master, drive)
         _check_mode_supported(master, drive)
-        _check_ratings(master, drive)
-    mappings = []
+        rated = _check_ratings(master, drive)
+        if _is_held(master, drive, rated.encoder_step_m or drive.encoder_step_m):
+            held.append(drive)
+    for drive in held:
+        remark(_end_quick_stop(master, drive))
+    mappings: list[DriveMapping] = []
     for drive in drives:
         # The mapping may only be changed here (CiA 301), and cyclic frames would overtake the answers.
         master.nmt(drive.node_id, "pre-operational")
-        mappings.append(_configure_drive(master, drive))
+        mappings.append(_configure_drive(master, drive, remark))
     return mappings
 
 
@@ -145,23 +175,21 @@ def _check_settings(drives: list[DriveSettings]) -> None:
             raise ProfileError(f"node id {drive.node_id} is used twice on the bus; give each node its own")
         if not 1 <= drive.heartbeat_ms <= 0xFFFF:
             raise ProfileError(f"node {drive.node_id}: heartbeat of {drive.heartbeat_ms} ms is outside 1 .. 65535")
+        if not 1 <= drive.rpdo_deadline_ms <= 0xFFFF:
+            raise ProfileError(f"node {drive.node_id}: RPDO deadline {drive.rpdo_deadline_ms} ms is outside 1 .. 65535")
         if drive.mode not in _MODES:
             raise ProfileError(f"node {drive.node_id}: mode = {drive.mode!r} is not one of {', '.join(_MODES)}")
 
 
 def _check_identity(master: "Master", drive: DriveSettings) -> None:
-    vendor, product, _, _ = master.identity(drive.node_id)
-    wanted_vendor, wanted_product = drive.identity
-    if vendor != wanted_vendor:
-        raise DriveError(
-            f"node {drive.node_id}: 0x1018:01 vendor id: wanted 0x{wanted_vendor:X}, read 0x{vendor:X}; "
-            "the opened backend and the drives on this bus don't belong together: correct --backend or identity"
-        )
-    if wanted_product is not None and product != wanted_product:
-        raise DriveError(
-            f"node {drive.node_id}: 0x1018:02 product code: wanted 0x{wanted_product:X}, read 0x{product:X}; "
-            "swap the node ids or correct identity in the profile"
-        )
+    shown = master.identity(drive.node_id)
+    for subindex, (name, wanted, read) in enumerate(zip(_IDENTITY_NAMES, drive.identity, shown, strict=False), 1):
+        if wanted is not None and read != wanted:
+            said = "nothing" if read is None else f"0x{read:X}"
+            raise DriveError(
+                f"node {drive.node_id}: 0x1018:{subindex:02X} {name}: wanted 0x{wanted:X}, read {said}; "
+                f"{_IDENTITY_REMEDIES[name]}"
+            )
     device_type = master.read(drive.node_id, cia402.DEVICE_TYPE, 0)
     if device_type & 0xFFFF != _CIA402_PROFILE_NUMBER:
         raise DriveError(
@@ -170,13 +198,52 @@ def _check_identity(master: "Master", drive: DriveSettings) -> None:
         )
 
 
-def _check_at_rest(master: "Master", drive: DriveSettings) -> None:
+_IDENTITY_REMEDIES = {
+    "vendor id": "the opened backend and the drives on this bus don't belong together: correct --backend or identity",
+    "product code": "swap the node ids or correct identity in the profile",
+    "revision number": "load the firmware that the profile was made for, or correct identity.revision_number",
+    "serial number": "this is another unit of that drive: check its parameters, then correct identity.serial_number",
+}
+
+
+def _is_held(master: "Master", drive: DriveSettings, step_m: float | None) -> bool:
+    """Return whether a quick stop holds the drive still; DriveError where it has power otherwise, or still moves."""
     state = cia402.state_of(master.read(drive.node_id, cia402.STATUSWORD, 0))
-    if state in _ENERGISED:
+    if state not in _ENERGISED:
+        return False
+    place = f"node {drive.node_id}: 0x6041:00 shows {state.name}, wanted a drive without power; "
+    if state is not cia402.State.QUICK_STOP_ACTIVE:
+        raise DriveError(place + "another master drives it, or a run ended badly: disable it first")
+    if step_m is None:
+        raise DriveError(place + "no encoder tells whether it stands: switch its power off and on")
+    # Without power the axis coasts: a ramp that is still under way must come to its end first.
+    before = master.read(drive.node_id, cia402.POSITION_ACTUAL_VALUE, 0)
+    master.pause(_REST_WINDOW_S)
+    after = master.read(drive.node_id, cia402.POSITION_ACTUAL_VALUE, 0)
+    speed_m_per_s = abs(after - before) * step_m / _REST_WINDOW_S
+    if not speed_m_per_s <= _REST_M_PER_S:
         raise DriveError(
-            f"node {drive.node_id}: 0x6041:00 shows {state.name}, wanted a drive without power; "
-            "another master drives it, or a run ended badly: disable it first"
+            f"{place}it moves at {speed_m_per_s:.4g} m/s by its encoder, and its quick stop is ended below "
+            f"{_REST_M_PER_S:g} m/s only: wait until it stands, then arm again"
         )
+    return True
+
+
+def _end_quick_stop(master: "Master", drive: DriveSettings) -> str:
+    """Disable voltage (CiA 402 transition 12); returns what the operator should know."""
+    master.write(drive.node_id, cia402.CONTROLWORD, 0, cia402.DISABLE_VOLTAGE)
+    for _ in range(round(_LEAVE_TIMEOUT_S / _LEAVE_STEP_S)):
+        state = cia402.state_of(master.read(drive.node_id, cia402.STATUSWORD, 0))
+        if state not in _ENERGISED:
+            return (
+                f"node {drive.node_id} stood in QUICK_STOP_ACTIVE, as a run that was killed leaves it; its power was "
+                f"taken away (0x6040 = 0), it shows {state.name}"
+            )
+        master.pause(_LEAVE_STEP_S)
+    raise DriveError(
+        f"node {drive.node_id}: 0x6041:00 shows {state.name} {_LEAVE_TIMEOUT_S:g} s after 0x6040 = 0, wanted "
+        "SWITCH_ON_DISABLED; switch its power off and on"
+    )
 
 
 def _check_mode_supported(master: "Master", drive: DriveSettings) -> None:
@@ -191,7 +258,7 @@ def _check_mode_supported(master: "Master", drive: DriveSettings) -> None:
         )
 
 
-def _check_ratings(master: "Master", drive: DriveSettings) -> None:
+def _check_ratings(master: "Master", drive: DriveSettings) -> RatedValues:
     rated = read_rated_values(master, drive.node_id)
     if rated.torque_word != drive.rated_torque_word:
         raise DriveError(
@@ -210,9 +277,10 @@ def _check_ratings(master: "Master", drive: DriveSettings) -> None:
                 f"node {drive.node_id}: 0x608F encoder resolution: wanted {drive.encoder_step_m:g} m a count, "
                 f"read {rated.encoder_step_m:g} m; correct encoder_step_m or the drive"
             )
+    return rated
 
 
-def _configure_drive(master: "Master", drive: DriveSettings) -> DriveMapping:
+def _configure_drive(master: "Master", drive: DriveSettings, remark: Callable[[str], None]) -> DriveMapping:
     """Write and read back everything; the limits first, so that no half-armed drive is stronger than it may be."""
     node_id = drive.node_id
     store = _Store(master, node_id)
@@ -243,13 +311,13 @@ def _configure_drive(master: "Master", drive: DriveSettings) -> DriveMapping:
     store(cia402.MODES_OF_OPERATION, 0, _MODES[drive.mode], "mode of operation", remedy)
 
     _silence_other_pdos(master, store)
+    _watch_the_servo(store, drive, remark)
     rpdo, rpdo_id = _map_pdo(
         store,
         cia402.RPDO_COMMUNICATION,
         RPDO1_ID + node_id,
         _MAPPING_TORQUE if drive.mode == "torque" else _MAPPING_POSITION,
         TRANSMISSION_EVERY_SYNC,
-        timer_ms=drive.rpdo_deadline_ms,
     )
     tpdo, tpdo_id = _map_pdo(
         store, cia402.TPDO_COMMUNICATION, TPDO1_ID + node_id, _MAPPING_ACTUAL, TRANSMISSION_EVERY_SYNC
@@ -264,6 +332,61 @@ def _configure_drive(master: "Master", drive: DriveSettings) -> DriveMapping:
     )
     emcy_id = master.read(node_id, cia402.COB_ID_EMCY, 0) & _ID_MASK
     return DriveMapping(node_id, rpdo, tpdo, inputs, rpdo_id, tpdo_id, inputs_id, emcy_id)
+
+
+def detection_time_s(drive: DriveSettings) -> float:
+    """Return the longest that a drive without RPDO deadline keeps up the last torque of a dead servo.
+
+    The heartbeat is missed 0x1016 after the last one, which is at most a cycle older than the last command. A SYNC
+    that fails to come is not counted on: no object says after how many periods a drive reacts.
+    """
+    return 1e-3 * drive.heartbeat_ms + 1e-6 * drive.cycle_us
+
+
+def torque_cap_n(stale: StaleTorque, detection_s: float) -> float:
+    """Return the force that uses up `way_m` within the detection time: 2 m s / t^2."""
+    return 2.0 * stale.mass_kg * stale.way_m / (detection_s * detection_s)
+
+
+def _watch_the_servo(store: "_Store", drive: DriveSettings, remark: Callable[[str], None]) -> None:
+    """Set the RPDO deadline; where the drive has none, cap its torque for the time until it misses the heartbeat."""
+    stale, detection_s = drive.stale_torque, detection_time_s(drive)
+    _invalidate(store, cia402.RPDO_COMMUNICATION)
+    remedy = "without it the last torque of a dead servo stays until the heartbeat is missed, and nothing here bounds "
+    remedy += 'how far that pushes: use macro.mode = "position", or a drive or firmware that has it'
+    try:
+        store(cia402.RPDO_COMMUNICATION, 5, drive.rpdo_deadline_ms, "event timer", remedy)
+        return
+    except DriveError as error:
+        if drive.mode == "torque" and stale is None:
+            raise
+        lacking = f"node {drive.node_id} has no RPDO deadline (0x1400:05)"
+        until = f"a dead servo is noticed by its heartbeat after {detection_s * 1e3:g} ms"
+        if drive.mode == "position" or stale is None:
+            remark(f"{lacking}: {until}, and the drive holds its last target until then")
+            return
+        rated_n = 1e-3 * drive.rated_torque_word
+        cap_n = torque_cap_n(stale, detection_s)
+        word = math.floor(1e3 * cap_n / rated_n)
+        physics = f"2 x {stale.mass_kg:.4g} kg x {stale.way_m * 1e3:.3g} mm / ({detection_s * 1e3:g} ms)^2"
+        if word >= drive.max_torque_word:
+            remark(f"{lacking}: {until}, in which {cap_n:.4g} N do no harm ({physics}): its torque stays as it was")
+            return
+        if not 1e-3 * word * rated_n >= stale.needed_n:
+            longest_s = math.sqrt(2.0 * stale.mass_kg * stale.way_m / stale.needed_n) - 1e-6 * drive.cycle_us
+            longest_ms = math.floor(1e3 * longest_s)  # 0x1016 counts them
+            shorten = f"shorten trip.heartbeat_s to {1e-3 * longest_ms:g} s, " if longest_ms >= 1 else ""
+            raise DriveError(
+                f"{lacking}: {until}, so its torque may be {cap_n:.3g} N at most ({physics}), and the profile's motion "
+                f"takes {stale.needed_n:.3g} N; {shorten}lower macro.acceleration_limit_m_per_s2 and "
+                f"macro.stop_deceleration_m_per_s2 to fit, or use a drive that has it ({error})"
+            ) from error
+        remedy = "the drive must take a lower limit where it has no RPDO deadline: use another firmware or drive"
+        store(cia402.MAX_TORQUE, 0, word, "max torque", remedy)
+        remark(
+            f"{lacking}: {until}, so max torque (0x6072) is {1e-3 * word * rated_n:.4g} N instead of "
+            f"{1e-3 * drive.max_torque_word * rated_n:.4g} N ({physics})"
+        )
 
 
 class _Store:
@@ -314,6 +437,16 @@ def _silence_other_pdos(master: "Master", store: _Store) -> None:
             store(index, 1, cob_id | PDO_INVALID, "COB-ID of an unused PDO", remedy, _COB_ID_CARE)
 
 
+_PDO_REMEDY = "this drive can't carry the PDO that the servo needs: use another firmware, or correct its EDS"
+
+
+def _invalidate(store: _Store, communication: int) -> int:
+    """Switch a PDO off, as bits 0 .. 30 may not change while it is valid; returns the COB-ID that it had."""
+    held = store.master.read(store.node_id, communication, 1)
+    store(communication, 1, held | PDO_INVALID, "COB-ID used by PDO", _PDO_REMEDY, _COB_ID_CARE)
+    return held
+
+
 def _map_pdo(
     store: _Store,
     communication: int,
@@ -321,14 +454,11 @@ def _map_pdo(
     wanted_words: tuple[int, ...],
     transmission: int,
     inhibit_100us: int = 0,
-    timer_ms: int = 0,
 ) -> tuple[Codec, int]:
     """Map one PDO as CiA 301 wants it (invalid, count 0, entries, count, valid); return codec and id read back."""
     mapping = communication + 0x200
-    remedy = "this drive can't carry the PDO that the servo needs: use another firmware, or correct its EDS"
-    held = store.master.read(store.node_id, communication, 1)
-    # Bits 0 .. 30 may not change while the PDO is valid.
-    store(communication, 1, held | PDO_INVALID, "COB-ID used by PDO", remedy, _COB_ID_CARE)
+    remedy = _PDO_REMEDY
+    held = _invalidate(store, communication)
     store(mapping, 0, 0, "number of mapped objects", remedy)
     for subindex, word in enumerate(wanted_words, 1):
         store.put(mapping, subindex, word, f"mapped object {subindex}", remedy)
@@ -336,9 +466,6 @@ def _map_pdo(
     store(communication, 2, transmission, "transmission type", remedy)
     if inhibit_100us:
         store(communication, 3, inhibit_100us, "inhibit time", "lengthen or shorten the inhibit time of the inputs")
-    if timer_ms:
-        remedy_deadline = "a drive without an RPDO deadline needs rpdo_deadline_s = 0 and a capped torque"
-        store(communication, 5, timer_ms, "event timer", remedy_deadline)
     no_remote = held & 1 << 30
     store(communication, 1, no_remote | can_id, "COB-ID used by PDO", remedy, _COB_ID_CARE)
 

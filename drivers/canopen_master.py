@@ -64,13 +64,20 @@ class Master:
 
     synchronous: no receiver thread; whoever owns the bus delivers frames by calling `notify`
     (a bus with an `attach(notify)` method is given it), before or while `send` returns.
-    clock_s: the clock of heartbeat ages and emergencies, in s.
+    clock_s: the clock of heartbeat ages and emergencies, in s; pause: lets that many seconds pass on it.
     """
 
-    def __init__(self, bus: can.BusABC, synchronous: bool = False, clock_s: Callable[[], float] = time.monotonic):
+    def __init__(
+        self,
+        bus: can.BusABC,
+        synchronous: bool = False,
+        clock_s: Callable[[], float] = time.monotonic,
+        pause: Callable[[float], None] = time.sleep,
+    ):
         self._bus = bus
         self._synchronous = synchronous
         self._clock_s = clock_s
+        self.pause = pause
         self._sdo_lock = threading.Lock()  # canopen's SDO client has none
         self._subscribers_lock = threading.Lock()  # nor has its table of subscribers
         self._heartbeat_t_s: dict[int, float] = {}
@@ -154,11 +161,14 @@ class Master:
             ) from error
         self._transfer(node_id, index, subindex, data)
 
-    def identity(self, node_id: int) -> tuple[int, int, int, int]:
-        """Return (vendor, product, revision, serial) of 0x1018; 0 where the drive has no such entry."""
+    def identity(self, node_id: int) -> tuple[int | None, int | None, int | None, int | None]:
+        """Return (vendor, product, revision, serial) of 0x1018; None where the drive or its EDS has no such entry."""
         highest = self.read(node_id, cia402.IDENTITY, 0)
         vendor, product, revision, serial = (
-            self.read(node_id, cia402.IDENTITY, subindex) if subindex <= highest else 0 for subindex in (1, 2, 3, 4)
+            self.read(node_id, cia402.IDENTITY, subindex)
+            if subindex <= highest and self.has(node_id, cia402.IDENTITY, subindex)
+            else None
+            for subindex in (1, 2, 3, 4)
         )
         return vendor, product, revision, serial
 

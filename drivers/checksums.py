@@ -6,7 +6,6 @@ Pure.
 import binascii
 from collections.abc import Callable
 from functools import reduce
-from operator import xor
 
 
 def _sum8(data: bytes) -> int:
@@ -14,7 +13,7 @@ def _sum8(data: bytes) -> int:
 
 
 def _xor8(data: bytes) -> int:
-    return reduce(xor, data, 0)
+    return reduce(int.__xor__, data, 0)
 
 
 def _crc16_ccitt(data: bytes) -> int:

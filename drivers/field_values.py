@@ -5,6 +5,7 @@ Pure; shared by the three kinds of generic frame.
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from drivers.frame_spec import FieldSpec
 from drivers.reading import END_VALID, MACRO_VALID
@@ -49,7 +50,7 @@ class FieldValues:
                 return False
         return True
 
-    def frame(self, values: Sequence, next_raw: int) -> Frame:
+    def frame(self, values: Sequence[Any], next_raw: int) -> Frame:
         """The frame; `next_raw` numbers it where the device sends no sequence."""
         flags = self.axes
         if self._status >= 0:

@@ -4,7 +4,9 @@ Pure. No checksum: flag bits find the block, a counter finds what was lost, a fl
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, cast
 
 from drivers import snapshot as snapshots
 from drivers.field_values import FieldValues
@@ -16,7 +18,7 @@ from drivers.sequence import SequenceTracker
 class FlagBitsFramer:
     """Framer of kind flagbits."""
 
-    def __init__(self, table: Mapping, *, incremental: bool) -> None:
+    def __init__(self, table: Mapping[str, Any], *, incremental: bool) -> None:
         """`table` is the profile's [interferometer.frame]; ProfileError where it makes no block.
 
         `tags` are the top bits of a value's bytes in wire order; the last byte of every value but the first carries
@@ -24,10 +26,14 @@ class FlagBitsFramer:
         """
         only(table, {"tag_bits", "tags", "more_tag", "order", "values_count", "fields"}, "frame")
         tag_bits = integer(table, "tag_bits", 2, 1, 4)
-        tags = table.get("tags", (0, 1, 2))
+        given: Any = table.get("tags", (0, 1, 2))
         highest = (1 << tag_bits) - 1
-        if not isinstance(tags, list | tuple) or not tags or any(not 0 <= int(tag) <= highest for tag in tags):
-            raise wrong("frame.tags", tags, f"must be a list of numbers within 0 .. {highest}", "correct it")
+        listed = cast(Sequence[Any], given) if isinstance(given, list | tuple) else ()
+        if not listed or any(not 0 <= int(tag) <= highest for tag in listed):
+            raise wrong(
+                "frame.tags", table.get("tags"), f"must be a list of numbers within 0 .. {highest}", "correct it"
+            )
+        tags = tuple(int(tag) for tag in listed)
         more_tag = integer(table, "more_tag", highest, 0, highest)
         if tags[-1] in tags[:-1] or more_tag in tags:
             raise wrong(
@@ -93,7 +99,7 @@ class FlagBitsFramer:
     def _decode(self, buffer: bytes, start: int) -> list[int]:
         mask, shifts = self._mask, self._shifts
         size = len(shifts)
-        values = []
+        values: list[int] = []
         for spec in self._specs:
             value = 0
             place = start + spec.index * size
@@ -129,7 +135,7 @@ class FlagBitsFramer:
         self.counters.restore(parts["counters"])
 
 
-def _pattern(tags, more_tag: int, payload_bits: int, count: int) -> re.Pattern[bytes]:
+def _pattern(tags: tuple[int, ...], more_tag: int, payload_bits: int, count: int) -> re.Pattern[bytes]:
     def byte(tag: int) -> bytes:
         low, high = tag << payload_bits, (tag << payload_bits) | ((1 << payload_bits) - 1)
         return rb"[\x%02x-\x%02x]" % (low, high)
@@ -140,10 +146,6 @@ def _pattern(tags, more_tag: int, payload_bits: int, count: int) -> re.Pattern[b
 
 def _with_modulus(specs: tuple[FieldSpec, ...], bits: int) -> tuple[FieldSpec, ...]:
     """A counter wraps at the width of a value unless the profile says otherwise."""
-    fields = FieldSpec.__slots__
     return tuple(
-        FieldSpec(**{**{name: getattr(spec, name) for name in fields}, "modulus": 1 << bits})
-        if spec.role == "sequence" and spec.modulus == 0
-        else spec
-        for spec in specs
+        replace(spec, modulus=1 << bits) if spec.role == "sequence" and spec.modulus == 0 else spec for spec in specs
     )

@@ -3,8 +3,9 @@
 Pure; knows no bytes.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 from stagectl.errors import ProfileError
 
@@ -42,14 +43,14 @@ def wrong(key: str, value: object, limit: str, remedy: str) -> ProfileError:
     return ProfileError(f"interferometer.{key} = {value!r}: {limit}; {remedy}")
 
 
-def only(table: Mapping, allowed: set[str], where: str) -> None:
+def only(table: Mapping[str, Any], allowed: set[str], where: str) -> None:
     """Refuse keys that nobody reads."""
     for key in table:
         if key not in allowed:
             raise wrong(f"{where}.{key}", table[key], f"no such key (known: {', '.join(sorted(allowed))})", "remove it")
 
 
-def integer(table: Mapping, key: str, default: int, low: int, high: int, where: str = "frame") -> int:
+def integer(table: Mapping[str, Any], key: str, default: int, low: int, high: int, where: str = "frame") -> int:
     """An integer of `table` within limits."""
     value = table.get(key)
     if value is None:
@@ -59,7 +60,7 @@ def integer(table: Mapping, key: str, default: int, low: int, high: int, where: 
     return value
 
 
-def flag(table: Mapping, key: str, default: bool, where: str = "frame") -> bool:
+def flag(table: Mapping[str, Any], key: str, default: bool, where: str = "frame") -> bool:
     """A truth value of `table`."""
     value = table.get(key)
     if value is None:
@@ -69,7 +70,7 @@ def flag(table: Mapping, key: str, default: bool, where: str = "frame") -> bool:
     return value
 
 
-def choice(table: Mapping, key: str, default: str, allowed: tuple[str, ...], where: str = "frame") -> str:
+def choice(table: Mapping[str, Any], key: str, default: str, allowed: tuple[str, ...], where: str = "frame") -> str:
     """One word of `allowed`."""
     value = table.get(key)
     if value is None:
@@ -79,16 +80,19 @@ def choice(table: Mapping, key: str, default: str, allowed: tuple[str, ...], whe
     return str(value)
 
 
-def field_specs(table: Mapping, types: tuple[str, ...]) -> tuple[FieldSpec, ...]:
+def field_specs(table: Mapping[str, Any], types: tuple[str, ...]) -> tuple[FieldSpec, ...]:
     """The `fields` of a frame table: at least a macro or an end, each role once, check and ignore freely."""
-    rows = table.get("fields")
+    rows: Any = table.get("fields")
     if not isinstance(rows, list | tuple) or not rows:
-        raise wrong("frame.fields", rows, "must be a list with at least one field", "describe the frame's fields")
-    specs = []
-    for number, row in enumerate(rows):
+        raise wrong(
+            "frame.fields", table.get("fields"), "must be a list with at least one field", "describe the frame's fields"
+        )
+    specs: list[FieldSpec] = []
+    for number, given in enumerate(cast(Sequence[Any], rows)):
         where = f"frame.fields[{number}]"
-        if not isinstance(row, Mapping):
-            raise wrong(where, row, "must be a table", "write { name = ..., role = ... }")
+        if not isinstance(given, Mapping):
+            raise wrong(where, given, "must be a table", "write { name = ..., role = ... }")
+        row = cast(Mapping[str, Any], given)
         only(row, _FIELD_KEYS, where)
         role = choice(row, "role", "ignore", ROLES, where)
         kind = choice(row, "type", types[0], types, where)

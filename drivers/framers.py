@@ -4,7 +4,7 @@ Pure; a chooser and nothing else.
 """
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Any, Protocol
 
 from drivers.frame_spec import flag, wrong
 from drivers.generic_frame import KINDS, generic_framer
@@ -33,10 +33,10 @@ class Framer(Protocol):
         ...
 
 
-def framer_for(interferometer: Mapping) -> Framer:
+def framer_for(interferometer: Mapping[str, Any]) -> Framer:
     """Make the framer that [interferometer] describes; ProfileError where it describes none."""
     name = interferometer.get("format")
-    table = interferometer.get("frame") or {}
+    table: Mapping[str, Any] = interferometer.get("frame") or {}
     incremental = flag(interferometer, "incremental", True, "interferometer")
     if isinstance(name, str) and name in _OWN:
         return _OWN[name](table, incremental=incremental)

@@ -4,6 +4,7 @@ Pure; a chooser and nothing else.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 from drivers.flagbits_frame import FlagBitsFramer
 from drivers.frame_spec import wrong
@@ -13,7 +14,9 @@ from drivers.syncfixed_frame import SyncFixedFramer
 KINDS = {"syncfixed": SyncFixedFramer, "line": LineFramer, "flagbits": FlagBitsFramer}
 
 
-def generic_framer(kind: str, table: Mapping, *, incremental: bool) -> SyncFixedFramer | LineFramer | FlagBitsFramer:
+def generic_framer(
+    kind: str, table: Mapping[str, Any], *, incremental: bool
+) -> SyncFixedFramer | LineFramer | FlagBitsFramer:
     """Make the framer of `kind` from the profile's [interferometer.frame]."""
     if kind not in KINDS:
         raise wrong("format", kind, f"must be one of {', '.join(KINDS)}", "correct it")

@@ -3,6 +3,8 @@
 Pure; knows no protocol.
 """
 
+from typing import Any
+
 from drivers.reading import FramerCounters
 
 CAPACITY_BYTES = 4096
@@ -42,11 +44,11 @@ class LineBuffer:
             self._overlong = True
         return lines
 
-    def snapshot(self) -> list:
+    def snapshot(self) -> list[Any]:
         """Plain values that `restore` takes."""
         return [self._rest.hex(), self._overlong]
 
-    def restore(self, values: list) -> None:
+    def restore(self, values: list[Any]) -> None:
         """Go on from where `snapshot` was taken."""
         self._rest = bytes.fromhex(values[0])
         self._overlong = bool(values[1])

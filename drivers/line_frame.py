@@ -5,6 +5,7 @@ Pure. No checksum: a line is believed for its shape, its field count and its seq
 
 import re
 from collections.abc import Mapping
+from typing import Any
 
 from drivers import snapshot as snapshots
 from drivers.field_values import FieldValues
@@ -22,7 +23,7 @@ _DIGITS_MOST = 40
 class LineFramer:
     """Framer of kind line."""
 
-    def __init__(self, table: Mapping, *, incremental: bool) -> None:
+    def __init__(self, table: Mapping[str, Any], *, incremental: bool) -> None:
         """`table` is the profile's [interferometer.frame]; ProfileError where it makes no line."""
         only(table, {"delimiter", "separator", "columns_count", "ignore_prefix", "fields"}, "frame")
         delimiter = _text(table, "delimiter", "\r\n")
@@ -70,7 +71,7 @@ class LineFramer:
             readings += self._tracker.admit(self._values.frame(values, self._tracker.next_raw))
         return readings
 
-    def _read(self, match: re.Match[bytes]) -> list | None:
+    def _read(self, match: re.Match[bytes]) -> list[Any] | None:
         texts = [match.group(group) for group, _ in self._readers]
         if any(len(text) > _DIGITS_MOST for text in texts):
             return None
@@ -95,7 +96,7 @@ class LineFramer:
         self.counters.restore(parts["counters"])
 
 
-def _text(table: Mapping, key: str, default: str) -> bytes:
+def _text(table: Mapping[str, Any], key: str, default: str) -> bytes:
     value = table.get(key)
     if value is None:
         return default.encode()

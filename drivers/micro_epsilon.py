@@ -6,7 +6,8 @@ the sensor send COUNTER, as the last value: a byte slipped into the last value t
 The sensor must have OUTHOLD NONE, else it repeats the last good value on an error. Pure.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 from drivers.flagbits_frame import FlagBitsFramer
 from drivers.frame_spec import integer, only, wrong
@@ -27,16 +28,20 @@ ERROR_TEXT = {
 _VALUES = ("macro", "end", "counter", "ignore")
 
 
-def micro_epsilon_framer(table: Mapping, *, incremental: bool) -> FlagBitsFramer:
+def micro_epsilon_framer(table: Mapping[str, Any], *, incremental: bool) -> FlagBitsFramer:
     """Make the framer; `values` names the values of a block in order, e.g. ["macro", "end", "counter"]."""
     only(table, {"values", "counter_modulus", "counts_per_wavelength"}, "frame")
-    values = table.get("values")
-    if not isinstance(values, list | tuple) or not values or any(value not in _VALUES for value in values):
+    given: Any = table.get("values")
+    values = cast(Sequence[Any], given) if isinstance(given, list | tuple) else ()
+    if not values or any(value not in _VALUES for value in values):
         raise wrong(
-            "frame.values", values, f"must be a list of {', '.join(_VALUES)}", "name the values in output order"
+            "frame.values",
+            table.get("values"),
+            f"must be a list of {', '.join(_VALUES)}",
+            "name the values in output order",
         )
     modulus = integer(table, "counter_modulus", 1 << 18, 2, 1 << 18)
-    fields = []
+    fields: list[dict[str, object]] = []
     for index, value in enumerate(values):
         field: dict[str, object] = {"name": value, "index": index, "role": "sequence" if value == "counter" else value}
         if value == "counter":

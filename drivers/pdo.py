@@ -24,8 +24,10 @@ _SLOTS = {
     (cia402.DIGITAL_INPUTS, 0): ("digital_inputs", False),
 }
 
-_FORMATS = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h", (32, False): "I", (32, True): "i"}
-_FORMATS |= {(64, False): "Q", (64, True): "q"}
+_FORMATS = {
+    **{(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h"},
+    **{(32, False): "I", (32, True): "i", (64, False): "Q", (64, True): "q"},
+}
 
 PAYLOAD_LIMIT_BYTES = 8
 

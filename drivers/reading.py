@@ -25,7 +25,7 @@ class Reading:
     end_counts: float
     flags: int
 
-    def as_list(self) -> list:
+    def as_list(self) -> list[int | float | None]:
         """Plain values for a snapshot; nan becomes None, which JSON has."""
         macro = None if math.isnan(self.macro_counts) else self.macro_counts
         end = None if math.isnan(self.end_counts) else self.end_counts

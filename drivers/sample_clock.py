@@ -83,7 +83,7 @@ def init(
 
 
 @compiled
-def _start_window(state, w, sequence, arrival_t_ns):
+def _start_window(state: np.ndarray, w: int, sequence: int, arrival_t_ns: int) -> None:
     s = state[0]
     s.origin_sequence[w] = sequence
     s.origin_t_ns[w] = arrival_t_ns
@@ -94,7 +94,7 @@ def _start_window(state, w, sequence, arrival_t_ns):
 
 
 @compiled
-def _restart(state, sequence, arrival_t_ns):
+def _restart(state: np.ndarray, sequence: int, arrival_t_ns: int) -> None:
     s = state[0]
     s.samples = 0
     s.active = 0
@@ -106,7 +106,7 @@ def _restart(state, sequence, arrival_t_ns):
 
 
 @compiled
-def _add(state, w, x, y, counts):
+def _add(state: np.ndarray, w: int, x: float, y: float, counts: bool) -> None:
     """Put a point on the right end of a window's lower hull."""
     s = state[0]
     if counts:
@@ -140,7 +140,7 @@ def _add(state, w, x, y, counts):
 
 
 @compiled
-def _solve(state, w, x):
+def _solve(state: np.ndarray, w: int, x: float) -> float:
     """Write slope, delay and deviation; return the line's height at x, in ns after the window's own zero."""
     s = state[0]
     hull_x = s.hull_x[w]
@@ -221,7 +221,7 @@ def _solve(state, w, x):
 
 
 @compiled
-def step(state, sequence, arrival_t_ns):
+def step(state: np.ndarray, sequence: int, arrival_t_ns: int) -> None:
     """Take a sample's number and the time at which it became readable; a number that goes back starts anew."""
     s = state[0]
     if s.samples == 0:
@@ -282,7 +282,7 @@ def step(state, sequence, arrival_t_ns):
 
 
 @compiled
-def sample_t_ns(state, sequence):
+def sample_t_ns(state: np.ndarray, sequence: int) -> int:
     """Instant of sample `sequence` on the host's clock, int64 ns; also of one to come. Needs one sample."""
     s = state[0]
     ahead = (sequence - s.sequence) * (s.period_ns + s.slope_ns) + s.sample_fraction_ns
@@ -290,21 +290,21 @@ def sample_t_ns(state, sequence):
 
 
 @compiled
-def sample_age_ns(state, sequence, t_ns):
+def sample_age_ns(state: np.ndarray, sequence: int, t_ns: int) -> float:
     """t_ns minus the instant of sample `sequence`, float64 with its part of a nanosecond."""
     s = state[0]
     return float(t_ns - s.sample_t_ns) - (sequence - s.sequence) * (s.period_ns + s.slope_ns) - s.sample_fraction_ns
 
 
 @compiled
-def clock_rate_ppm(state):
+def clock_rate_ppm(state: np.ndarray) -> float:
     """How much the sensor's samples come too fast against the host's clock, in ppm (slow is negative)."""
     s = state[0]
     return (s.period_ns / (s.period_ns + s.slope_ns) - 1.0) * 1e6
 
 
 @compiled
-def uncertainty_s(state):
+def uncertainty_s(state: np.ndarray) -> float:
     """Standard deviation of the newest sample's instant, in s; infinite before the first sample.
 
     Holds for delays that fall freely; where arrivals are bundled `grid_ns` must say so.

@@ -3,7 +3,8 @@
 Pure. Every position is made of the whole count, never by adding up differences.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from drivers.frame_spec import wrong
 
@@ -26,12 +27,13 @@ def position_m(counts: float, zero_counts: float, metres_per_count_m: float) -> 
     return (counts - zero_counts) * metres_per_count_m
 
 
-def counts_per_wavelength_of(interferometer: Mapping) -> tuple[float, float]:
+def counts_per_wavelength_of(interferometer: Mapping[str, Any]) -> tuple[float, float]:
     """Counts per wavelength of macro and end as the profile's [interferometer.frame] gives them, per field or once."""
-    table = interferometer.get("frame") or {}
-    both = table.get("counts_per_wavelength")
-    found = {"macro": both, "end": both}
-    for field in table.get("fields") or ():
+    table: Mapping[str, Any] = interferometer.get("frame") or {}
+    both: Any = table.get("counts_per_wavelength")
+    found: dict[str, Any] = {"macro": both, "end": both}
+    rows: Sequence[Mapping[str, Any]] = table.get("fields") or ()
+    for field in rows:
         if field.get("role") in found and field.get("counts_per_wavelength") is not None:
             found[field["role"]] = field["counts_per_wavelength"]
     macro = found["macro"] if found["macro"] is not None else found["end"]
@@ -40,4 +42,4 @@ def counts_per_wavelength_of(interferometer: Mapping) -> tuple[float, float]:
         if isinstance(value, bool) or not isinstance(value, int | float) or not 1e-3 <= value <= 1e12:
             remedy = "counts over a displacement of one wavelength, e.g. 2048.0"
             raise wrong("frame.counts_per_wavelength", value, "must be a number within 1e-3 .. 1e12", remedy)
-    return float(macro), float(end)  # pyright: ignore[reportArgumentType]
+    return float(macro), float(end)

@@ -5,7 +5,7 @@ Pure; knows no bytes and no clock.
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from drivers.reading import END_VALID, MACRO_VALID, REFERENCE_LOST, RESTARTED, FramerCounters, Reading
 
@@ -129,7 +129,7 @@ class SequenceTracker:
         self._counters.frames_ok += 1
         return Reading(sequence, frame.macro_counts, frame.end_counts, flags)
 
-    def snapshot(self) -> dict:
+    def snapshot(self) -> dict[str, Any]:
         """Plain values that `restore` takes."""
         held = self._held
         return {
@@ -141,7 +141,7 @@ class SequenceTracker:
             else [held.raw, *Reading(0, held.macro_counts, held.end_counts, held.flags).as_list()[1:], held.check],
         }
 
-    def restore(self, values: dict) -> None:
+    def restore(self, values: dict[str, Any]) -> None:
         """Go on from where `snapshot` was taken."""
         self._last_raw = int(values["last_raw"])
         self._last_sequence = int(values["last_sequence"])

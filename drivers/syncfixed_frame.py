@@ -5,6 +5,7 @@ Pure; without a checksum a frame is believed when the next sync follows it, one 
 
 import struct
 from collections.abc import Mapping
+from typing import Any
 
 from drivers import snapshot as snapshots
 from drivers.checksums import CHECKSUMS
@@ -19,7 +20,7 @@ _FORMATS = {"u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32": "i"
 class SyncFixedFramer:
     """Framer of kind syncfixed."""
 
-    def __init__(self, table: Mapping, *, incremental: bool) -> None:
+    def __init__(self, table: Mapping[str, Any], *, incremental: bool) -> None:
         """`table` is the profile's [interferometer.frame]; ProfileError where it makes no frame."""
         only(table, {"sync", "length", "endian", "checksum", "fields"}, "frame")
         self._sync = _sync(table)
@@ -114,7 +115,7 @@ class SyncFixedFramer:
         self.counters.restore(parts["counters"])
 
 
-def _sync(table: Mapping) -> bytes:
+def _sync(table: Mapping[str, Any]) -> bytes:
     text = table.get("sync")
     try:
         sync = bytes.fromhex(text) if isinstance(text, str) else b""

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 from drivers import snapshot as snapshots
 from drivers.frame_spec import flag, integer, only, wrong
@@ -66,11 +67,14 @@ _LOW_SPEED = {
     8: ("sample_rate_hz", 0.01, 1.0, 1e6),
 }
 
+_AIR_STEPS = {3: 0.5, 5: 100.0, 6: 5.0}
+"""Code -> the most by which air changes between two tellings; more is a wrong digit until it is said again."""
+
 
 class Umd2Framer:
     """Framer of a uMD2 line with one or more axes."""
 
-    def __init__(self, table: Mapping, *, incremental: bool) -> None:
+    def __init__(self, table: Mapping[str, Any], *, incremental: bool) -> None:
         """`table` is the profile's [interferometer.frame]: macro_axis, end_axis (0 = there is none), columns_count,
         phase_bits (until the device says otherwise), homodyne, velocity_check."""
         only(table, _KEYS, "frame")
@@ -93,8 +97,11 @@ class Umd2Framer:
         self._axes = (MACRO_VALID if macro_axis else 0) | (END_VALID if end_axis else 0)
         self._checked = tuple(column for column in (self._macro, self._end) if column >= 0) if check else ()
         self._phase_bits = phase_bits
-        self._phase_bits_said = phase_bits
+        self._phase_bits_said: int = phase_bits
         self.environment = Environment()
+        self.air = {_LOW_SPEED[code][0]: math.nan for code in _AIR_STEPS}  # said alike twice in a row; nan = not yet
+        self.air_number = 0  # counts changes of `air`
+        self._air_said = dict.fromkeys(_AIR_STEPS, math.nan)
         self.counters = FramerCounters()
         self._lines = LineBuffer(b"\r\n", self.counters)
         self._tracker = SequenceTracker(
@@ -113,10 +120,8 @@ class Umd2Framer:
         for line in self._lines.feed(data):
             if line.startswith(b"!"):  # debug text of the firmware
                 continue
-            frame = None
-            if self._pattern.fullmatch(line):
-                numbers = list(map(int, line.split(b" ")))
-                frame = self._frame(numbers)
+            numbers = list(map(int, line.split(b" "))) if self._pattern.fullmatch(line) else []
+            frame = self._frame(numbers) if numbers else None
             if frame is None:
                 self.counters.field_count_bad += 1
                 self.counters.bytes_discarded += len(line) + 2
@@ -182,6 +187,13 @@ class Umd2Framer:
             value = data * factor
             if low <= value <= high:
                 setattr(environment, name, value)
+                if code in _AIR_STEPS:
+                    # A line has no checksum, and one wrong digit in 20.00 degC would move a stage by micrometres.
+                    agrees = abs(value - self._air_said[code]) <= _AIR_STEPS[code]
+                    self._air_said[code] = value
+                    if agrees and value != self.air[name]:
+                        self.air[name] = value
+                        self.air_number += 1
         elif code == 10:
             environment.firmware = (data & 0xFFFF) / 100.0
             environment.firmware_sub = float(data >> 16)
@@ -199,12 +211,17 @@ class Umd2Framer:
     def snapshot(self) -> bytes:
         """State as JSON bytes."""
         environment = {name: None if math.isnan(value) else value for name, value in asdict(self.environment).items()}
+        said = [(code, None if math.isnan(value) else value) for code, value in self._air_said.items()]
+        air = {name: None if math.isnan(value) else value for name, value in self.air.items()}
         return snapshots.pack(
             "umd2",
             lines=self._lines.snapshot(),
             junk=self._junk,
             phase_bits=[self._phase_bits, self._phase_bits_said],
             environment=environment,
+            air=air,
+            air_number=self.air_number,
+            air_said=said,
             tracker=self._tracker.snapshot(),
             counters=self.counters.as_dict(),
         )
@@ -218,6 +235,9 @@ class Umd2Framer:
         for field in fields(self.environment):
             value = parts["environment"][field.name]
             setattr(self.environment, field.name, math.nan if value is None else float(value))
+        self.air = {name: math.nan if value is None else float(value) for name, value in parts["air"].items()}
+        self.air_number = int(parts["air_number"])
+        self._air_said = {int(code): math.nan if value is None else float(value) for code, value in parts["air_said"]}
         self._tracker.restore(parts["tracker"])
         self.counters.restore(parts["counters"])
 

@@ -4,21 +4,27 @@
 last process data) and reads no clock: times come with the inbox. Pure; opens nothing.
 """
 
+import contextlib
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from drivers import cia402, sample_clock
-from drivers.air import ciddor_index
+from drivers.air import ciddor_index, ramped_index
 from drivers.arming import SYNC_ID, DriveMapping
 from drivers.framers import framer_for
+from drivers.pdo import Codec
 from drivers.reading import END_VALID, MACRO_VALID, REFERENCE_LOST, RESTARTED, Reading
 from drivers.scale import counts_per_wavelength_of, metres_per_count
-from stagectl.errors import LinkError
+from drivers.umd2 import Umd2Framer
+from stagectl.errors import LinkError, RequestError
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 SERVO_NODE_ID = 0x7E
 HEARTBEAT_FRAME = (0x700 + SERVO_NODE_ID, b"\x05")
@@ -30,6 +36,7 @@ _POWERED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia4
 _NO_ERROR = b"\0\0"  # an EMCY that takes the one before back
 _DISAGREEMENTS_IN_A_ROW = 5  # a host that holds a SYNC up by a millisecond is no lost reference
 _CLOCK_SAMPLES = 200  # before the sample clock can tell that a number came too early
+_INDEX_STEP = 2e-8  # Ciddor's own uncertainty; below it the last digits of sensors flicker (0.01 K: 1e-8)
 _EARLIEST_SHARE = 0.5  # of the transport's constant part: no line of a sample younger than this can be there
 
 
@@ -87,7 +94,7 @@ class Inbox:
 
 def frame_names(mappings: Mapping[str, DriveMapping]) -> dict[int, str]:
     """Return the inbox slot of every CAN id that the servo listens to."""
-    names = {}
+    names: dict[int, str] = {}
     for axis, mapping in mappings.items():
         names[mapping.tpdo_id] = f"{axis}_tpdo"
         names[mapping.inputs_id] = f"{axis}_inputs_tpdo"
@@ -98,7 +105,7 @@ def frame_names(mappings: Mapping[str, DriveMapping]) -> dict[int, str]:
 class WireDecoder:
     """Everything that turns an inbox into a measurement; `snapshot` and `restore` make replay start anywhere."""
 
-    def __init__(self, profile, mappings: Mapping[str, DriveMapping]):
+    def __init__(self, profile: "Profile", mappings: Mapping[str, DriveMapping]):
         """Build framer, clock and scales from a profile (attributes named as in a profile file)."""
         sensor = profile.interferometer
         table = sensor.model_dump()
@@ -108,13 +115,12 @@ class WireDecoder:
         self.clock = sample_clock.init(self.period_ns, sensor.transport_s * 1e9)
         self._fresh_clock = self.clock.copy()
         self.restarts = 0
-        air = profile.air
-        self.air_index = ciddor_index(
-            air.wavelength_vacuum_m, air.temperature_degc, air.pressure_pa, air.relative_humidity_percent, air.co2_ppm
-        )
-        macro_counts, end_counts = counts_per_wavelength_of(table)
-        self.macro_m_per_count = metres_per_count(air.wavelength_vacuum_m, self.air_index, macro_counts)
-        self.end_m_per_count = metres_per_count(air.wavelength_vacuum_m, self.air_index, end_counts)
+        self._air = profile.air.model_dump()
+        self._counts_per_wavelength = counts_per_wavelength_of(table)
+        self._air_number: int = 0  # of the device's own air that the target is made of; 0 = the profile's
+        self._air_target = ciddor_index(**self._air)
+        self.macro_m_per_count = self.end_m_per_count = math.nan
+        self._use_index(self._air_target)
         self.macro_zero_counts = math.nan
         self.end_zero_counts = math.nan
         self.macro_counts = math.nan
@@ -137,7 +143,7 @@ class WireDecoder:
         self._disagreement_m = sensor.encoder_disagreement_m
         self._incremental = sensor.incremental
         self._single = profile.micro is None
-        self._axes = {}
+        self._axes: dict[str, tuple[Codec, int, int, int, float, float, str]] = {}
         for axis, settings in (("macro", profile.macro), ("micro", profile.micro)):
             if settings is not None and axis in self.mappings:
                 codec = self.mappings[axis].tpdo
@@ -150,6 +156,28 @@ class WireDecoder:
                     settings.rated_force_n * 1e-3,
                     f"{axis} (node {self.mappings[axis].node_id})",
                 )
+
+    def _use_index(self, index: float) -> None:
+        """Scale counts with this index of air from here on."""
+        self.air_index = index
+        macro_counts, end_counts = self._counts_per_wavelength
+        self.macro_m_per_count = metres_per_count(self._air["wavelength_vacuum_m"], index, macro_counts)
+        self.end_m_per_count = metres_per_count(self._air["wavelength_vacuum_m"], index, end_counts)
+
+    def _follow_air(self) -> None:
+        """Take the air that the device measured, and bring the index towards it without a step of any position."""
+        framer = self.framer
+        if isinstance(framer, Umd2Framer) and framer.air_number != self._air_number:
+            self._air_number = framer.air_number
+            told = {name: value for name, value in framer.air.items() if not math.isnan(value)}
+            with contextlib.suppress(RequestError):  # outside Ciddor's range it is no air of a stage: keep what was
+                target = ciddor_index(**{**self._air, **told})
+                if abs(target - self._air_target) > _INDEX_STEP:
+                    self._air_target = target
+        if self.air_index != self._air_target:
+            macro_m = abs(self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
+            end_m = abs(self.end_counts - self.end_zero_counts) * self.end_m_per_count
+            self._use_index(ramped_index(self.air_index, self._air_target, max(macro_m, end_m)))
 
     def _take_reading(self, reading: Reading) -> bool:
         """Take one reading; returns whether it is a valid sample of both axes."""
@@ -292,6 +320,7 @@ class WireDecoder:
             due = self.sequence + math.floor((age_ns - self._earliest_ns) / self.period_ns)
             self.cycle = max(due, self.cycle + 1 if valid and self.cycle < 0 else self.cycle, self.sequence)
             seen.sample_t_ns = sample_clock.sample_t_ns(self.clock, self.sequence)
+            self._follow_air()
             seen.macro_position_m = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
             seen.end_position_m = (self.end_counts - self.end_zero_counts) * self.end_m_per_count
             if valid and self.encoder_trusted and seen.tpdos_new & 1:
@@ -377,6 +406,9 @@ class WireDecoder:
         "_disagreements",
         "_macro_moved",
         "_end_moved",
+        "air_index",
+        "_air_number",
+        "_air_target",
     )
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -392,11 +424,12 @@ class WireDecoder:
         """Go on from where `snapshot` was taken."""
         for name, value in json.loads(bytes(snapshot["decoder_values"])).items():
             setattr(self, name, value)
+        self._use_index(self.air_index)
         self.framer.restore(bytes(snapshot["decoder_framer"]))
         self.clock[...] = snapshot["decoder_clock"]
 
 
-def _decoded(codec, payload: bytes, source: str) -> tuple[int, ...]:
+def _decoded(codec: Codec, payload: bytes, source: str) -> tuple[int, ...]:
     """Decode a PDO; LinkError says whose."""
     try:
         return codec.decode(payload)
@@ -417,7 +450,7 @@ def _loss_text(flags: int, single: bool) -> str:
 class WireEncoder:
     """A command and two controlwords to the frames of a cycle: micro first, then macro; SYNC is the caller's."""
 
-    def __init__(self, profile, mappings: Mapping[str, DriveMapping]):
+    def __init__(self, profile: "Profile", mappings: Mapping[str, DriveMapping]):
         """Take the RPDO codecs as read back from the drives."""
         self._position_mode = profile.macro.mode == "position"
         self._encoder_step_m = profile.macro.encoder_step_m

@@ -38,6 +38,7 @@ class Motor(Table):
     rated_force_n: Annotated[float, above(0.0, 1e5)] | None = None  # the drive's name plate; None = the EDS's value
     current_loop_s: Annotated[float, within(1e-6, 0.02)]
     force_noise_n: Annotated[float, within(0.0, 1e3)] = 0.0  # rms, held for a millisecond
+    has_rpdo_deadline: bool = True  # false = the drive lacks 0x1400:05, as many do
     stop_stiffness_n_per_m: Stiffness
     stop_damping_n_s_per_m: Damping
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import canopen
-from canopen.objectdictionary import ODVariable, datatypes
+from canopen.objectdictionary import ODRecord, ODVariable, datatypes
 
 from stagectl.errors import ProfileError
 
@@ -26,7 +26,7 @@ def load(path: str | Path, node_id: int, axis: Any) -> canopen.ObjectDictionary:
     """Read an EDS file and make it a rig drive's: vendor id, name plate of its motor, encoder step.
 
     `axis` is a [macro] or [micro] table; `rated_force_n` (the name plate, not the true constant) may be missing:
-    then the EDS file's 0x6076 stands.
+    then the EDS file's 0x6076 stands. Without `has_rpdo_deadline` the drive lacks 0x1400:05 that its EDS file has.
     """
     if not Path(path).is_file():
         raise ProfileError(f"{path}: the rig's EDS file is missing; give the path of an existing EDS file")
@@ -40,6 +40,11 @@ def load(path: str | Path, node_id: int, axis: Any) -> canopen.ObjectDictionary:
     if step_m is not None and 0x608F in dictionary:
         _set_default(dictionary, path, 0x608F, 1, round(1.0 / step_m))
         _set_default(dictionary, path, 0x608F, 2, 1)
+    if not getattr(axis, "has_rpdo_deadline", True):
+        _set_default(dictionary, path, 0x1400, 0, 3)
+        communication = dictionary[0x1400]
+        if isinstance(communication, ODRecord):
+            del communication[5]
     return dictionary
 
 

@@ -87,7 +87,7 @@ class Rig:
         self._sense = module.sense
         self._state = plant.init(machine)
         self._flat = self._state.view(np.float64)  # all fields are eight bytes wide, floats; memory stands last
-        self._names = {name: k for k, name in enumerate(plant.PLANT_STATE.names or ())}
+        self._names = {name: k for k, name in enumerate(plant.PLANT_STATE.names or ()) if name != "memory"}
         state = self.plant_state()
         macro_m, end_m = state["macro_position_m"], state["end_position_m"]
         self.nodes: list[DriveNode] = [self._node(machine.macro, "macro", macro_m)]
@@ -143,8 +143,12 @@ class Rig:
     # -- state --------------------------------------------------------------------------------------------------------
 
     def plant_state(self) -> dict[str, float]:
-        """Return the true state by name (`stagectl.plant.PLANT_STATE`)."""
-        return dict(zip(self._names, self._state.item(), strict=True))
+        """Return the true state by name (`stagectl.plant.PLANT_STATE`), but for the memory of effects."""
+        return dict(zip(self._names, self._state.item(), strict=False))  # the memory stands last, and has no name there
+
+    def effects_memory(self) -> np.ndarray:
+        """Return a copy of what the machine's effects remember."""
+        return self._state["memory"][0].copy()
 
     def _motors(self) -> tuple[tuple[float, float], ...]:
         """Return (position of the motor's encoder, current) of each node."""

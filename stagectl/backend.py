@@ -3,6 +3,7 @@
 Everything above sees a master's bus, an identity to demand, and a servo that runs when time passes.
 """
 
+import contextlib
 import json
 import os
 import secrets
@@ -79,6 +80,10 @@ class Backend(Protocol):
 
     def clock_s(self) -> float:
         """Return the clock of heartbeat ages."""
+        ...
+
+    def pause(self, duration_s: float) -> None:
+        """Let time pass while no servo runs."""
         ...
 
     def start_servo(self, profile: Profile, mappings: Mapping[str, DriveMapping], run_folder: Path) -> ServoLink:
@@ -210,8 +215,14 @@ class BatchBackend:
         """Return virtual time."""
         return self.wire.t_ns * 1e-9
 
+    def pause(self, duration_s: float) -> None:
+        """Let virtual time pass."""
+        self.wire.advance_to(self.wire.t_ns + round(duration_s * 1e9))
+
     def start_servo(self, profile: Profile, mappings: Mapping[str, DriveMapping], run_folder: Path) -> ServoLink:
         """Make the servo in this process; it runs when time passes."""
+        with contextlib.suppress(LinkError):  # of a port that is gone the servo says so
+            self.wire.serial.read()  # lines that waited are old: their arrival says nothing
         decoder = WireDecoder(profile, mappings)
         encoder = WireEncoder(profile, mappings)
         tracker = Tracker(profile, has_drives=True)
@@ -274,7 +285,9 @@ class _Child:
             bufsize=1,
             cwd=_ROOT,
             env=_CHILD_ENVIRONMENT,
+            process_group=0,  # Ctrl-C and Ctrl-Z are for the command: a frozen servo stops no stage
         )
+        self._has_spoken = False
 
     def tell(self, message: dict) -> None:
         """Send one line; LinkError where the process is gone."""
@@ -289,8 +302,13 @@ class _Child:
         stdout = self.process.stdout
         ready = stdout is not None and select.select([stdout], [], [], timeout_s)[0]
         line = stdout.readline() if ready and stdout is not None else ""
+        if not line and ready:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(2.0)  # its exit code comes right behind the end of its words
+            raise LinkError(f"the {self.name} process has nothing more to say ({self._end()}); see its messages above")
         if not line:
             raise LinkError(f"the {self.name} process said nothing within {timeout_s:g} s ({self._end()})")
+        self._has_spoken = True
         message = json.loads(line)
         if "error" in message:
             raise _KINDS.get(message.get("kind", ""), LinkError)(f"{self.name}: {message['error']}")
@@ -306,12 +324,14 @@ class _Child:
         return self.process.poll() is None
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """End it: terminate, then kill."""
+        """End it: terminate, then kill; at once where it still compiles, and holds nothing that moves."""
         for stream in (self.process.stdin, self.process.stdout):
             if stream is not None:
                 stream.close()
-        if self.running:
+        if self.running and self._has_spoken:
             self.process.terminate()
+        elif self.running:
+            self.process.kill()
         try:
             self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -352,6 +372,10 @@ class RealtimeBackend:
         """Return the clock of heartbeat ages."""
         return time.monotonic()
 
+    def pause(self, duration_s: float) -> None:
+        """Sleep."""
+        time.sleep(duration_s)
+
     @property
     def servo_pid(self) -> int:
         """Process id of the servo."""
@@ -375,6 +399,7 @@ class RealtimeBackend:
         cpus = sorted(os.sched_getaffinity(0))
         self._servo.tell(
             {
+                "profile": profile.effective(),
                 "mappings": {axis: describe_mapping(mapping) for axis, mapping in mappings.items()},
                 "interface": self._interface,
                 "channel": self._channel,
@@ -468,7 +493,11 @@ class RigBackend(RealtimeBackend):
         command = [sys.executable, "-m", "sim_backend", str(machine), "--socket", channel, "--pty-link", port]
         command += ["--seed", str(seed), "--truth", str(self._truth_path), "--linger-s", str(linger_s)]
         self._rig = _Child("rig", command)
-        self._rig.hear(_WARM_TIMEOUT_S)
+        try:
+            self._rig.hear(_WARM_TIMEOUT_S)
+        except BaseException:
+            self.close()
+            raise
         self.description = f"software rig {Path(machine).stem}, real time, seed {seed}"
 
     @property

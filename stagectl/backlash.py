@@ -12,9 +12,15 @@ recursive least-squares estimate a side. The force of the motor is the decoded i
 the sample interval through the current loop, never the float that was asked. Pure; knows no bus and no clock.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stagectl.compiled import compiled
+from stagectl.signals import Record
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 _CHAINS = ("end", "joint", "force")
 _SIDES = ("left", "right")
@@ -91,7 +97,7 @@ _SURE_SDS = 5.0  # that a stiffness is above zero by before an edge is published
 _CORRELATION_SAMPLES = 20.0  # samples that share one independent residual, from the filter's memory of 3 tau
 
 
-def init(profile, filter_s: float = 0.01, forgetting_ratio: float = 1.0) -> np.ndarray:
+def init(profile: "Profile", filter_s: float = 0.01, forgetting_ratio: float = 1.0) -> np.ndarray:
     """Make BACKLASH: nothing known of edges and stiffness, whatever the profile believes."""
     b = np.zeros(1, BACKLASH)
     h = 1.0 / profile.cycle.rate_hz
@@ -129,7 +135,7 @@ def init(profile, filter_s: float = 0.01, forgetting_ratio: float = 1.0) -> np.n
 
 
 @compiled
-def _filtered(b, z1, z2, z3, old, new):
+def _filtered(b: Record, z1: float, z2: float, z3: float, old: float, new: float) -> tuple[float, float, float]:
     """Advance one chain by a period with its input going from `old` to `new` in a line."""
     n1 = b.decay_0 * z1 + b.old_1 * old + b.new_1 * new
     n2 = b.decay_1 * z1 + b.decay_0 * z2 + b.old_2 * old + b.new_2 * new
@@ -138,7 +144,7 @@ def _filtered(b, z1, z2, z3, old, new):
 
 
 @compiled
-def _update(b, side, regressor_0, regressor_1, regressor_2, y):
+def _update(b: Record, side: int, regressor_0: float, regressor_1: float, regressor_2: float, y: float) -> float:
     """One recursive least-squares step of a side (0 left, 1 right); (20) with h(k) (E9)."""
     theta = b.theta
     p = b.covariance
@@ -160,7 +166,7 @@ def _update(b, side, regressor_0, regressor_1, regressor_2, y):
 
 
 @compiled
-def _publish_edge(b, side, residual_n2):
+def _publish_edge(b: Record, side: int, residual_n2: float) -> tuple[float, float, float, float]:
     """Return (edge, its sd, stiffness, its sd) of a side in x_b; nan and inf where the force does not grow with x_b.
 
     A force that is no contact (a cable, a wrong offset) may be held long enough to pass the gate.
@@ -182,7 +188,7 @@ def _publish_edge(b, side, residual_n2):
 
 
 @compiled
-def step(b, cycle, macro_position_m, end_position_m, mean_force_n, q):
+def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, mean_force_n: float, q: Record) -> None:
     """Take a sample and the mean force (motor and effects) on the micro since the last; a missed cycle restarts."""
     x_b = macro_position_m - end_position_m
     if b.started == 0.0 or cycle != b.cycle + 1:
@@ -224,9 +230,10 @@ def step(b, cycle, macro_position_m, end_position_m, mean_force_n, q):
     if abs(y) > least_n:
         b.greatest_force_n = max(b.greatest_force_n, abs(y))
     side = 0.0
-    if b.right_sd_m < b.margin_m and x_b > b.right_m + b.margin_m:
+    # A damped joint lets go while it still overlaps: k p + c p' < 0, and a contact never pulls.
+    if b.right_sd_m < b.margin_m and x_b > b.right_m + b.margin_m and y > least_n:
         side = 1.0
-    elif b.left_sd_m < b.margin_m and x_b < -b.left_m - b.margin_m:
+    elif b.left_sd_m < b.margin_m and x_b < -b.left_m - b.margin_m and y < -least_n:
         side = -1.0
     elif abs(y) > max(b.force_share_ratio * b.greatest_force_n, least_n):
         side = 1.0 if y > 0.0 else -1.0
@@ -260,7 +267,9 @@ def step(b, cycle, macro_position_m, end_position_m, mean_force_n, q):
 
 
 @compiled
-def motor_mean_force(b, q, word_before, word, amperes_per_word, delay_s):
+def motor_mean_force(
+    b: Record, q: Record, word_before: float, word: float, amperes_per_word: float, delay_s: float
+) -> float:
     """Return the micro motor's mean force over the interval that ends at the new sample, from the words sent.
 
     The word before holds for `delay_s`, then the new one; the current follows with the loop's time constant.

@@ -5,6 +5,7 @@ Sample age, quantisation, noise and delay are the sensor's and the drives' of a 
 
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -158,7 +159,7 @@ class Recording:
     backlash: np.ndarray
 
 
-def simulation(controller: Controller, machine, *, latch_delay_s: float, seed: int) -> Simulation:
+def simulation(controller: Controller, machine: Any, *, latch_delay_s: float, seed: int) -> Simulation:
     """Put a controller in front of a machine (attributes named as in a machine file)."""
     if controller.estimator["position_mode"][0] != 0.0:
         raise RequestError("macro.mode = 'position': the value seam has no drive that closes the loop; use the rig")

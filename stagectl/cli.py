@@ -1,10 +1,16 @@
 """The command line: arguments and help, nothing else. What a command does stands in `stagectl.commands`."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+
+from stagectl import commands
+
+if TYPE_CHECKING:
+    from stagectl.commands.answer import Answer, Voice
 
 _EXIT_CODES = (
     "Exit codes: 0 done; 1 ended early (guard, drive, or a replay that differs); 2 wrong usage, profile or request; "
@@ -40,36 +46,61 @@ runs_app = typer.Typer(
 app.add_typer(profile_app, name="profile")
 app.add_typer(runs_app, name="runs")
 
-Json = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else; progress on stderr.")]
-ProfileOption = Annotated[
-    str,
-    typer.Option("--profile", "-p", help="Profile: a name or a TOML file.", envvar="STAGECTL_PROFILE", metavar="NAME"),
+
+# ---- what can be asked: each option once --------------------------------------------------------------------------
+
+
+def _option(help: str, *names: str, metavar: str | None = None, **more: Any) -> Any:
+    return typer.Option(*names, help=help, metavar=metavar, **more)
+
+
+_AUTO = "auto takes the rig only where neither the profile's CAN interface nor its serial port exists, and says so"
+
+Json = Annotated[bool, _option("One JSON object on stdout and nothing else; progress on stderr.", "--json")]
+Profile = Annotated[
+    str, _option("Profile: a name or a TOML file.", "--profile", "-p", metavar="NAME", envvar="STAGECTL_PROFILE")
 ]
-Backend = Annotated[
+Wire = Annotated[str, _option(f"auto | hardware | rig. {_AUTO}.", "--backend", metavar="WORLD")]
+WireOrPlant = Annotated[
     str,
-    typer.Option(
+    _option(
+        f"auto | hardware | rig | plant. {_AUTO}; plant is the machine straight behind the law, without bytes.",
         "--backend",
-        help="auto | hardware | rig | plant. auto takes the rig only where neither the profile's CAN interface nor its "
-        "serial port exists, and says so; plant is the machine straight behind the law, without bytes.",
         metavar="WORLD",
     ),
 ]
-Wire = Annotated[
-    str,
-    typer.Option(
-        "--backend",
-        help="auto | hardware | rig. auto takes the rig only where neither the profile's CAN interface nor its serial "
-        "port exists, and says so.",
-        metavar="WORLD",
-    ),
+Runs = Annotated[Path, _option("Folder of the runs.", "--runs", metavar="FOLDER", envvar="STAGECTL_RUNS")]
+Seed = Annotated[int, _option("Seed of the rig's noise.", "--seed", min=0)]
+Law = Annotated[str | None, _option("Control law: dsmc | pid (default: the profile's).", "--law", metavar="LAW")]
+Kind = Annotated[
+    str, _option("trapezoid | sine | move | FILE.csv (header t_s,position_m).", "--trajectory", "-t", metavar="WHAT")
 ]
-RunsRoot = Annotated[Path, typer.Option("--runs", help="Folder of the runs.", envvar="STAGECTL_RUNS", metavar="FOLDER")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of the rig's noise.", min=0)]
-Law = Annotated[
-    str | None, typer.Option("--law", help="Control law: dsmc | pid (default: the profile's).", metavar="LAW")
+Stroke = Annotated[float | None, _option("trapezoid: distance there and back, signed.")]
+Speed = Annotated[float | None, _option("trapezoid: speed between the corners.")]
+Dwell = Annotated[float | None, _option("trapezoid: rest at each end.")]
+Start = Annotated[float | None, _option("trapezoid, sine: where it begins.")]
+Amplitude = Annotated[float | None, _option("sine: half of its swing.")]
+Frequency = Annotated[float | None, _option("sine: frequency.")]
+Duration = Annotated[float | None, _option("sine: whole time, ramps included.")]
+Target = Annotated[float | None, _option("move: where to, from the homed zero.")]
+SweepFrequency = Annotated[float, _option("Frequency of the sweep over both edges.", min=0.05, max=5.0)]
+SweepDuration = Annotated[float, _option("How long to sweep.", min=2.0, max=240.0)]
+Distance = Annotated[float, _option("How far, signed.", "--distance-m")]
+ExportFormat = Annotated[str, _option("csv | parquet | mat.", "--format", "-f", metavar="FORMAT")]
+Columns = Annotated[str | None, _option("Fields to take, with commas between (default: all).", metavar="A,B,...")]
+ExportFile = Annotated[
+    Path | None, _option("File to write (default: samples.FORMAT in the run).", "--out", metavar="FILE")
 ]
+ColumnMap = Annotated[list[str] | None, _option("NAME=COLUMN:UNIT, once for each.", "--column", metavar="MAP")]
+ColumnMapFile = Annotated[Path | None, _option("TOML file with the same.", "--map", metavar="FILE")]
+PlotPlace = Annotated[
+    Path | None,
+    _option("A page (.html), or a folder for PNG files (default: report.html in the run).", "--out", metavar="PLACE"),
+]
+
 RunArgument = Annotated[str, typer.Argument(help="A run: its folder, its name, or 'latest'.", metavar="RUN")]
 ProfileArgument = Annotated[str, typer.Argument(help="A name or a TOML file.", metavar="PROFILE")]
+TableArgument = Annotated[Path, typer.Argument(help="A .csv or .mat file.", metavar="TABLE")]
 
 _PROFILE, _RUNS = "oled-printer", Path("runs")
 
@@ -82,37 +113,29 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", callback=_version, is_eager=True)
-    ] = False,
-) -> None:
-    """Servo controller for macro-micro stages."""
+Version = Annotated[bool, _option("Print the version.", "--version", callback=_version, is_eager=True)]
 
 
-def _deliver(command: str, as_json: bool, work: Any) -> NoReturn:
+# ---- the commands -------------------------------------------------------------------------------------------------
+
+
+def _deliver(command: str, as_json: bool, work: "Callable[[Voice], Answer]") -> NoReturn:
     from stagectl.commands.answer import deliver
 
     deliver(command, as_json, work)
 
 
+@app.callback()
+def _root(version: Version = False) -> None:
+    """Servo controller for macro-micro stages."""
+
+
 @app.command(epilog=_epilog("stagectl demo", "stagectl demo --json --runs /tmp/runs"))
 def demo(
-    profile: ProfileOption = _PROFILE,
-    backend: Wire = "rig",
-    seed: Seed = 1,
-    runs: RunsRoot = _RUNS,
-    json: Json = False,
+    profile: Profile = _PROFILE, backend: Wire = "rig", seed: Seed = 1, runs: Runs = _RUNS, json: Json = False
 ) -> None:
     """Home, identify the backlash, follow the same trajectory under PID and under DSMC; table, figures, report."""
-
-    def work(voice):
-        from stagectl.commands import demo as command
-
-        return command.show(voice, profile, backend, runs, seed)
-
-    _deliver("demo", json, work)
+    _deliver("demo", json, lambda voice: commands.demo.show(voice, profile, backend, runs, seed))
 
 
 @app.command(
@@ -123,192 +146,120 @@ def demo(
     )
 )
 def run(
-    trajectory: Annotated[
-        str,
-        typer.Option(
-            "--trajectory", "-t", help="trapezoid | sine | move | FILE.csv (header t_s,position_m).", metavar="WHAT"
-        ),
-    ] = "trapezoid",
-    stroke_m: Annotated[float | None, typer.Option(help="trapezoid: distance there and back, signed.")] = None,
-    velocity_m_per_s: Annotated[float | None, typer.Option(help="trapezoid: speed between the corners.")] = None,
-    dwell_s: Annotated[float | None, typer.Option(help="trapezoid: rest at each end.")] = None,
-    start_m: Annotated[float | None, typer.Option(help="trapezoid, sine: where it begins.")] = None,
-    amplitude_m: Annotated[float | None, typer.Option(help="sine: half of its swing.")] = None,
-    frequency_hz: Annotated[float | None, typer.Option(help="sine: frequency.")] = None,
-    duration_s: Annotated[float | None, typer.Option(help="sine: whole time, ramps included.")] = None,
-    target_m: Annotated[float | None, typer.Option(help="move: where to, from the homed zero.")] = None,
+    trajectory: Kind = "trapezoid",
+    stroke_m: Stroke = None,
+    velocity_m_per_s: Speed = None,
+    dwell_s: Dwell = None,
+    start_m: Start = None,
+    amplitude_m: Amplitude = None,
+    frequency_hz: Frequency = None,
+    duration_s: Duration = None,
+    target_m: Target = None,
     law: Law = None,
-    profile: ProfileOption = _PROFILE,
-    backend: Backend = "auto",
+    profile: Profile = _PROFILE,
+    backend: WireOrPlant = "auto",
     seed: Seed = 1,
-    runs: RunsRoot = _RUNS,
+    runs: Runs = _RUNS,
     json: Json = False,
 ) -> None:
     """Arm, home, follow one trajectory, come to rest; the run is recorded and scored."""
 
-    def work(voice):
-        from stagectl.commands import motion
-        from stagectl.commands.planning import Shape
-
-        shape = Shape(stroke_m, velocity_m_per_s, dwell_s, start_m, amplitude_m, frequency_hz, duration_s, target_m)
-        return motion.run(voice, profile, backend, runs, seed, trajectory, shape, law)
+    def work(voice: "Voice") -> "Answer":
+        shape = commands.planning.Shape(
+            stroke_m, velocity_m_per_s, dwell_s, start_m, amplitude_m, frequency_hz, duration_s, target_m
+        )
+        return commands.motion.run(voice, profile, backend, runs, seed, trajectory, shape, law)
 
     _deliver("run", json, work)
 
 
 @app.command(epilog=_epilog("stagectl identify", "stagectl identify --frequency-hz 0.7 --duration-s 30"))
 def identify(
-    frequency_hz: Annotated[
-        float, typer.Option(help="Frequency of the sweep over both edges.", min=0.05, max=5.0)
-    ] = 1.0,
-    duration_s: Annotated[float, typer.Option(help="How long to sweep.", min=2.0, max=240.0)] = 20.0,
-    profile: ProfileOption = _PROFILE,
-    backend: Backend = "auto",
+    frequency_hz: SweepFrequency = 1.0,
+    duration_s: SweepDuration = 20.0,
+    profile: Profile = _PROFILE,
+    backend: WireOrPlant = "auto",
     seed: Seed = 1,
-    runs: RunsRoot = _RUNS,
+    runs: Runs = _RUNS,
     json: Json = False,
 ) -> None:
     """Identify the backlash: the micro sweeps over both edges of the joint, pressing with a few newtons."""
-
-    def work(voice):
-        from stagectl.commands import motion
-
-        return motion.identify(voice, profile, backend, runs, seed, frequency_hz, duration_s)
-
-    _deliver("identify", json, work)
+    _deliver(
+        "identify",
+        json,
+        lambda voice: commands.motion.identify(voice, profile, backend, runs, seed, frequency_hz, duration_s),
+    )
 
 
 @app.command(epilog=_epilog("stagectl jog --distance-m 0.01", "stagectl jog --distance-m -0.01 --law pid"))
 def jog(
-    distance_m: Annotated[float, typer.Option("--distance-m", help="How far, signed.")],
+    distance_m: Distance,
     law: Law = None,
-    profile: ProfileOption = _PROFILE,
+    profile: Profile = _PROFILE,
     backend: Wire = "auto",
     seed: Seed = 1,
-    runs: RunsRoot = _RUNS,
+    runs: Runs = _RUNS,
     json: Json = False,
 ) -> None:
     """Arm, home, move by a distance, come to rest."""
-
-    def work(voice):
-        from stagectl.commands import motion
-
-        return motion.jog(voice, profile, backend, runs, seed, distance_m, law)
-
-    _deliver("jog", json, work)
+    _deliver("jog", json, lambda voice: commands.motion.jog(voice, profile, backend, runs, seed, distance_m, law))
 
 
 @app.command(epilog=_epilog("stagectl home"))
 def home(
-    profile: ProfileOption = _PROFILE,
-    backend: Wire = "auto",
-    seed: Seed = 1,
-    runs: RunsRoot = _RUNS,
-    json: Json = False,
+    profile: Profile = _PROFILE, backend: Wire = "auto", seed: Seed = 1, runs: Runs = _RUNS, json: Json = False
 ) -> None:
     """Home: the macro on its drive's index, then the micro on both edges of the joint."""
-
-    def work(voice):
-        from stagectl.commands import motion
-
-        return motion.home(voice, profile, backend, runs, seed)
-
-    _deliver("home", json, work)
+    _deliver("home", json, lambda voice: commands.motion.home(voice, profile, backend, runs, seed))
 
 
 @app.command(epilog=_epilog("stagectl replay latest"))
-def replay(run: RunArgument, runs: RunsRoot = _RUNS, json: Json = False) -> None:
+def replay(run: RunArgument, runs: Runs = _RUNS, json: Json = False) -> None:
     """Send a run's raw bytes through the same code again and compare every value, bit for bit."""
-
-    def work(voice):
-        from stagectl.commands import runs as command
-
-        return command.replay(voice, run, runs)
-
-    _deliver("replay", json, work)
+    _deliver("replay", json, lambda voice: commands.runs.replay(voice, run, runs))
 
 
 @profile_app.command("check", epilog=_epilog("stagectl profile check my-stage.toml"))
 def profile_check(profile: ProfileArgument, json: Json = False) -> None:
     """Check a profile: every key, number, unit and relation; says all that is wrong at once."""
-
-    def work(voice):
-        from stagectl.commands import profiles
-
-        return profiles.check(voice, profile)
-
-    _deliver("profile check", json, work)
+    _deliver("profile check", json, lambda voice: commands.profiles.check(voice, profile))
 
 
 @profile_app.command("show", epilog=_epilog("stagectl profile show oled-printer"))
 def profile_show(profile: ProfileArgument = _PROFILE, json: Json = False) -> None:
     """Show a profile with every default filled in."""
-
-    def work(voice):
-        from stagectl.commands import profiles
-
-        return profiles.show(voice, profile)
-
-    _deliver("profile show", json, work)
+    _deliver("profile show", json, lambda voice: commands.profiles.show(voice, profile))
 
 
 @profile_app.command("list", epilog=_epilog("stagectl profile list"))
 def profile_list(json: Json = False) -> None:
     """List the profiles that a bare name can mean."""
-
-    def work(voice):
-        from stagectl.commands import profiles
-
-        return profiles.names(voice)
-
-    _deliver("profile list", json, work)
+    _deliver("profile list", json, lambda voice: commands.profiles.names(voice))
 
 
 @runs_app.command("list", epilog=_epilog("stagectl runs list"))
-def runs_list(runs: RunsRoot = _RUNS, json: Json = False) -> None:
+def runs_list(runs: Runs = _RUNS, json: Json = False) -> None:
     """List all runs; first recovers rows that a dead servo left in memory."""
-
-    def work(voice):
-        from stagectl.commands import runs as command
-
-        return command.names(voice, runs)
-
-    _deliver("runs list", json, work)
+    _deliver("runs list", json, lambda voice: commands.runs.names(voice, runs))
 
 
 @runs_app.command("show", epilog=_epilog("stagectl runs show latest"))
-def runs_show(run: RunArgument, runs: RunsRoot = _RUNS, json: Json = False) -> None:
+def runs_show(run: RunArgument, runs: Runs = _RUNS, json: Json = False) -> None:
     """Show what a run is, how it ended, and its scores."""
-
-    def work(voice):
-        from stagectl.commands import runs as command
-
-        return command.show(voice, run, runs)
-
-    _deliver("runs show", json, work)
+    _deliver("runs show", json, lambda voice: commands.runs.show(voice, run, runs))
 
 
 @runs_app.command("export", epilog=_epilog("stagectl runs export latest --columns t_ns,end_position_m"))
 def runs_export(
     run: RunArgument,
-    file_format: Annotated[str, typer.Option("--format", "-f", help="csv | parquet | mat.", metavar="FORMAT")] = "csv",
-    columns: Annotated[
-        str | None, typer.Option(help="Fields to take, with commas between (default: all).", metavar="A,B,...")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="File to write (default: samples.FORMAT in the run).", metavar="FILE")
-    ] = None,
-    runs: RunsRoot = _RUNS,
+    file_format: ExportFormat = "csv",
+    columns: Columns = None,
+    out: ExportFile = None,
+    runs: Runs = _RUNS,
     json: Json = False,
 ) -> None:
     """Write a run's rows as CSV, Parquet or MAT; nothing is rounded."""
-
-    def work(voice):
-        from stagectl.commands import runs as command
-
-        return command.export(voice, run, runs, file_format, columns, out)
-
-    _deliver("runs export", json, work)
+    _deliver("runs export", json, lambda voice: commands.runs.export(voice, run, runs, file_format, columns, out))
 
 
 @runs_app.command(
@@ -319,44 +270,20 @@ def runs_export(
     ),
 )
 def runs_import(
-    table: Annotated[Path, typer.Argument(help="A .csv or .mat file.", metavar="TABLE")],
-    column: Annotated[
-        list[str] | None, typer.Option("--column", help="NAME=COLUMN:UNIT, once for each.", metavar="MAP")
-    ] = None,
-    column_map: Annotated[Path | None, typer.Option("--map", help="TOML file with the same.", metavar="FILE")] = None,
-    runs: RunsRoot = _RUNS,
+    table: TableArgument,
+    column: ColumnMap = None,
+    column_map: ColumnMapFile = None,
+    runs: Runs = _RUNS,
     json: Json = False,
 ) -> None:
     """Make a run of a table that was measured elsewhere; says how every column was converted."""
-
-    def work(voice):
-        from stagectl.commands import runs as command
-
-        return command.bring_in(voice, table, runs, column or [], column_map)
-
-    _deliver("runs import", json, work)
+    _deliver("runs import", json, lambda voice: commands.runs.bring_in(voice, table, runs, column or [], column_map))
 
 
 @runs_app.command("plot", epilog=_epilog("stagectl runs plot latest", "stagectl runs plot latest --out figures"))
-def runs_plot(
-    run: RunArgument,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="A page (.html), or a folder for PNG files (default: report.html in the run).", metavar="PLACE"
-        ),
-    ] = None,
-    runs: RunsRoot = _RUNS,
-    json: Json = False,
-) -> None:
+def runs_plot(run: RunArgument, out: PlotPlace = None, runs: Runs = _RUNS, json: Json = False) -> None:
     """Draw a run: tracking, hold, backlash, identification, timing."""
-
-    def work(voice):
-        from stagectl.commands import runs as command
-
-        return command.plot(voice, run, runs, out)
-
-    _deliver("runs plot", json, work)
+    _deliver("runs plot", json, lambda voice: commands.runs.plot(voice, run, runs, out))
 
 
 _USAGE_ERROR: Any = typer.BadParameter.__base__
@@ -366,9 +293,8 @@ _USAGE_ERROR: Any = typer.BadParameter.__base__
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     argv = sys.argv[1:] if arguments is None else arguments
-    command = typer.main.get_command(app)
     try:
-        code = command.main(argv, prog_name="stagectl", standalone_mode=False)
+        code = typer.main.get_command(app).main(argv, prog_name="stagectl", standalone_mode=False)
     except _USAGE_ERROR as error:
         error.show()
         if "--json" in argv:
@@ -377,7 +303,7 @@ def main(arguments: list[str] | None = None) -> int:
             failure = {"kind": "UsageError", "message": error.format_message()}
             typer.echo(json_text.dumps({"exit_code": error.exit_code, "error": failure}, indent=2))
         return int(error.exit_code)
-    except typer.Abort:
+    except (typer.Abort, KeyboardInterrupt):  # before a command began, or behind its end
         return 130
     return int(code or 0)
 

@@ -8,10 +8,13 @@ cache folder of its own.
 import hashlib
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numba
 
+_Function = TypeVar("_Function", bound=Callable[..., Any])  # compiled, it is called as before
 _PACKAGES = ("stagectl", "sim_backend", "drivers")
 
 
@@ -39,19 +42,20 @@ CACHE_FOLDER.mkdir(parents=True, exist_ok=True)
 numba.config.CACHE_DIR = str(CACHE_FOLDER / "numba")  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
 
 
-def compiled(function):
+def compiled(function: _Function) -> _Function:
     """Compile `function` on first call. No fastmath (bits change); division by zero gives inf or nan, as in numpy."""
-    return numba.njit(cache=True, error_model="numpy", nogil=True)(function)
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True)(function))
 
 
-def direct(function, *arguments):
+def direct(function: Any, *arguments: Any) -> Callable[..., None]:
     """Return what `compiled` made of a function for these arguments' types, without the look at types in each call.
 
     That look costs 0.2 us for each structured array. Only for callers whose arrays never change their dtypes.
     """
-    return function.compile(tuple(numba.typeof(argument) for argument in arguments))
+    type_of = cast(Callable[[Any], Any], numba.typeof)  # pyright: ignore[reportUnknownMemberType]
+    return function.compile(tuple(type_of(argument) for argument in arguments))
 
 
-def inlined(function):
+def inlined(function: _Function) -> _Function:
     """Compile as `compiled` does, and melt into every compiled caller: for small functions of the innermost loop."""
-    return numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)(function)
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)(function))

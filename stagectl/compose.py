@@ -118,7 +118,7 @@ def advance(state, parameters, effect_parameters, until_s, longest_s, macro_a, m
 
 def _check(effects: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Copy the effect tables; refuse what is not in the catalogue or may not act there."""
-    checked = []
+    checked: list[dict[str, Any]] = []
     for number, table in enumerate(effects):
         row = dict(table)
         name, place = row.get("name"), row.get("acts_on")

@@ -8,9 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from stagectl import trajectory as trajectories
-from stagectl.errors import RequestError
 from stagectl.profile import Profile
-from stagectl.requests import Phase
 from stagectl.signals import Stop
 from stagectl.supervisor import Outcome, Supervisor
 
@@ -107,10 +105,8 @@ def _follow(stage: Supervisor, trajectory: trajectories.Trajectory, law: str) ->
 
 def _armed(stage: Supervisor, motion: Callable[[], Outcome], law: str | None = None) -> Outcome:
     """Enable the drives where they are not, then move."""
-    stop = stage.enable(law)
-    if stop is not Stop.NONE:
-        return Outcome("enable", stop, stage.recorder.rows_count, 0)
-    return motion()
+    armed = stage.armed(law)
+    return motion() if armed.finished else armed
 
 
 class _Flow:
@@ -123,29 +119,13 @@ class _Flow:
 
     def does(self, name: str, motion: Callable[[], Outcome]) -> bool:
         """Move, once more where the guard ended it; tells whether the motion came to its own end."""
-        outcome = self._attempt(name, motion)
+        outcome = motion()
         if not outcome.finished:
             trip = Trip(name, outcome)
             self.trips.append(trip)
             self._say(f"{trip.text}; acknowledging, arming again and repeating it once")
             self._stage.acknowledge()
-            if (
-                outcome.stop is not Stop.REFERENCE_LOST
-                or name == "home"
-                or self._attempt("home", self._stage.home).finished
-            ):
-                outcome = self._attempt(name, motion)
+            if outcome.stop is not Stop.REFERENCE_LOST or name == "home" or self._stage.home().finished:
+                outcome = motion()
         self.outcomes.append(outcome)
         return outcome.finished
-
-    def _attempt(self, name: str, motion: Callable[[], Outcome]) -> Outcome:
-        """Move; a stop between two parts of a motion is an end like any other."""
-        first_row = self._stage.recorder.rows_count
-        try:
-            return motion()
-        except RequestError:
-            status = self._stage.status()
-            if status["phase"] != Phase.STOPPED:
-                raise
-            rows = self._stage.recorder.rows_count - first_row
-            return Outcome(name, Stop(int(status["stop"])), first_row, rows)

@@ -8,11 +8,17 @@ next command acts, lag and dead time of the profile's command effects included, 
 knows no bus and no clock.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stagectl import compose
 from stagectl.compiled import compiled
 from stagectl.plant import PLANT_PARAMETERS, PLANT_STATE
+from stagectl.signals import Record
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 ESTIMATOR = np.dtype(
     [
@@ -50,7 +56,7 @@ _BRIDGED_SAMPLES = 10.0  # prediction over 10 ms is still within a few nm of the
 FREE_SUPPLY_V = 1e12  # a belief's current loop never runs out of voltage
 
 
-def belief(profile) -> np.ndarray:
+def belief(profile: "Profile") -> np.ndarray:
     """Make PLANT_PARAMETERS of what the profile believes (attributes named as in a profile)."""
     q = np.zeros(1, PLANT_PARAMETERS)
     macro, micro, backlash = profile.macro, profile.micro, profile.backlash
@@ -105,7 +111,7 @@ def kalman_gains(mass_kg: float, period_s: float, noise_m: float, drift_n_per_sq
     return gain * scale / scale[0]
 
 
-def init(profile) -> np.ndarray:
+def init(profile: "Profile") -> np.ndarray:
     """Make ESTIMATOR for a profile: gains from its noise and drift densities, nothing seen yet."""
     e = np.zeros(1, ESTIMATOR)
     period_s = 1.0 / profile.cycle.rate_hz
@@ -135,7 +141,7 @@ def init_model() -> np.ndarray:
 
 
 @compiled
-def start(e, s, m):
+def start(e: Record, s: Record, m: Record) -> None:
     """Place the believed machine at rest at the first sample."""
     s.macro_position_m = m.macro_position_m
     s.end_position_m = m.end_position_m
@@ -152,7 +158,7 @@ def start(e, s, m):
 
 
 @compiled
-def correct(e, s, q, macro_position_m, end_position_m):
+def correct(e: Record, s: Record, q: Record, macro_position_m: float, end_position_m: float) -> None:
     """Take a fresh sample into the believed machine."""
     innovation = macro_position_m - s.macro_position_m
     e.macro_innovation_m = innovation

@@ -38,15 +38,20 @@ def _class_of(dtype: np.dtype) -> type:
     layout = struct.Struct("=" + "".join(_LETTERS[dtype[name]] for name in names))
     pack_into, unpack_from, values_of = layout.pack_into, layout.unpack_from, attrgetter(*names)
 
-    def __init__(self, record: np.ndarray) -> None:
+    def __init__(self: Any, record: np.ndarray) -> None:
         self.memory = memoryview(record).cast("B")  # pyright: ignore[reportArgumentType]
         self.load()
 
-    def store(self) -> None:
+    def store(self: Any) -> None:
         pack_into(self.memory, 0, *values_of(self))
 
     assignments = ", ".join(f"self.{name}" for name in names)
     scope: dict[str, Any] = {"unpack_from": unpack_from}
     exec(f"def load(self):\n    {assignments} = unpack_from(self.memory)", scope)
-    body = {"__slots__": ("memory", *names), "__init__": __init__, "load": scope["load"], "store": store}
+    body: dict[str, Any] = {
+        "__slots__": ("memory", *names),
+        "__init__": __init__,
+        "load": scope["load"],
+        "store": store,
+    }
     return type("Fields", (), body)

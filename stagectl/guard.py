@@ -3,10 +3,15 @@
 Pure; knows no bus and no clock.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stagectl.compiled import compiled
-from stagectl.signals import Stop
+from stagectl.signals import Record, Stop
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 GUARD = np.dtype(
     [
@@ -20,6 +25,7 @@ GUARD = np.dtype(
         ("stroke_low_m", "f8"),
         ("stroke_high_m", "f8"),
         ("sensor_age_ns", "f8"),
+        ("sensor_ahead_ns", "f8"),  # a sample further ahead of its cycle is a clock fault, not a young sample
         ("overrun_ns", "f8"),
         ("silent_cycles", "f8"),
         ("lost_commands", "f8"),
@@ -60,6 +66,7 @@ _FORCE = int(Stop.FORCE)
 _FOLLOWING_ERROR = int(Stop.FOLLOWING_ERROR)
 _MICRO_STROKE = int(Stop.MICRO_STROKE)
 _SENSOR_AGE = int(Stop.SENSOR_AGE)
+_SAMPLE_AHEAD = int(Stop.SAMPLE_AHEAD)
 _REFERENCE_LOST = int(Stop.REFERENCE_LOST)
 _OVERRUN = int(Stop.OVERRUN)
 _THERMAL = int(Stop.THERMAL)
@@ -73,7 +80,7 @@ _LINK_SILENT = int(Stop.LINK_SILENT)
 _COMMAND_LOST = int(Stop.COMMAND_LOST)
 
 
-def init(profile, *, has_drives: bool) -> np.ndarray:
+def init(profile: "Profile", *, has_drives: bool) -> np.ndarray:
     """Make GUARD from the profile's limits."""
     g = np.zeros(1, GUARD)
     macro, micro, trip = profile.macro, profile.micro, profile.trip
@@ -86,6 +93,7 @@ def init(profile, *, has_drives: bool) -> np.ndarray:
     g["macro_force_limit_n"] = macro.force_limit_n
     g["following_error_m"] = profile.control.error_limit_m
     g["sensor_age_ns"] = trip.sensor_age_s * 1e9
+    g["sensor_ahead_ns"] = np.round(1e9 * period_s)
     g["overrun_ns"] = trip.overrun_s * 1e9
     g["silent_cycles"] = max(3.0, trip.sensor_age_s / period_s)
     g["lost_commands"] = max(3.0, trip.sensor_age_s / period_s)
@@ -104,7 +112,7 @@ def init(profile, *, has_drives: bool) -> np.ndarray:
 
 
 @compiled
-def _drives_stop(g, m):
+def _drives_stop(g: Record, m: Record) -> int:
     """Return why the drives' own words end the run."""
     trip = int(g.input_trip_mask)
     if g.braking != 0.0:  # why it brakes is known, and the macro's drive no longer takes part
@@ -135,7 +143,7 @@ def _drives_stop(g, m):
 
 
 @compiled
-def _motion_stop(g, m, now):
+def _motion_stop(g: Record, m: Record, now: Record) -> int:
     """Return why position, speed or stroke end the run."""
     if g.started == 0.0:
         g.started = 1.0
@@ -169,7 +177,7 @@ def _motion_stop(g, m, now):
 
 
 @compiled
-def step(g, m, now, macro_n, micro_n):
+def step(g: Record, m: Record, now: Record, macro_n: float, micro_n: float) -> int:
     """Return the Stop code for this cycle, NONE to go on; forces are what the law asked for."""
     if not (np.isfinite(m.macro_position_m) and np.isfinite(m.end_position_m)):
         return _MEASUREMENT_NOT_FINITE
@@ -183,6 +191,8 @@ def step(g, m, now, macro_n, micro_n):
         return _REFERENCE_LOST
     if not m.t_ns - m.sample_t_ns <= g.sensor_age_ns:
         return _SENSOR_AGE
+    if not m.sample_t_ns - m.t_ns <= g.sensor_ahead_ns:
+        return _SAMPLE_AHEAD
     if g.braking == 0.0:
         if not m.overrun_ns <= g.overrun_ns:
             return _OVERRUN

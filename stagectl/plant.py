@@ -12,9 +12,12 @@ one evaluation of the forces a substep. The calls of the effects stand in a gene
 (`stagectl.compose`), between `half_step` and `full_step`. Pure; knows no bus and no clock.
 """
 
+from typing import Any
+
 import numpy as np
 
 from stagectl.compiled import compiled, inlined
+from stagectl.signals import Record
 
 BRIDGE_OFF = 0
 BRIDGE_CURRENT = 1
@@ -121,7 +124,7 @@ _MOTOR_FIELDS = (
 )
 
 
-def parameters(machine, seed: int = 0) -> np.ndarray:
+def parameters(machine: Any, seed: int = 0) -> np.ndarray:
     """Make PLANT_PARAMETERS from a machine (attributes named as in a machine file)."""
     q = np.zeros(1, PLANT_PARAMETERS)
     macro, micro, backlash = machine.macro, machine.micro, machine.backlash
@@ -153,7 +156,7 @@ def parameters(machine, seed: int = 0) -> np.ndarray:
     return q
 
 
-def init(machine) -> np.ndarray:
+def init(machine: Any) -> np.ndarray:
     """Make PLANT_STATE at rest where the machine starts."""
     s = np.zeros(1, PLANT_STATE)
     s["macro_position_m"] = machine.start.macro_position_m
@@ -164,7 +167,7 @@ def init(machine) -> np.ndarray:
 
 
 @compiled
-def _mixed(value):
+def _mixed(value: np.uint64) -> np.uint64:
     """Spread the bits of a 64-bit counter (splitmix64, Steele, Lea, Flood 2014)."""
     z = value + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -173,7 +176,7 @@ def _mixed(value):
 
 
 @compiled
-def _gaussian(counter):
+def _gaussian(counter: np.uint64) -> float:
     """Return a standard normal number for a counter (Box-Muller on two mixed counters)."""
     a = _mixed(np.uint64(2) * counter)
     b = _mixed(np.uint64(2) * counter + np.uint64(1))
@@ -183,7 +186,7 @@ def _gaussian(counter):
 
 
 @compiled
-def _draw_noise(s, q):
+def _draw_noise(s: Record, q: Record) -> None:
     """Renew the held force noise when a new slot of time begins; depends on time and seed only."""
     t_s = s.t_s + 1e-9
     if t_s < s.noise_from_s or t_s >= s.noise_until_s:
@@ -196,7 +199,7 @@ def _draw_noise(s, q):
 
 
 @compiled
-def _take_decays(s, q, dt_s):
+def _take_decays(s: Record, q: Record, dt_s: float) -> None:
     """Bring the current loops' decays for this substep to the front; two are kept, exponentials are dear."""
     s.decay_dt_s, s.other_decay_dt_s = s.other_decay_dt_s, s.decay_dt_s
     s.macro_decay_ratio, s.other_macro_decay_ratio = s.other_macro_decay_ratio, s.macro_decay_ratio
@@ -212,7 +215,21 @@ def _take_decays(s, q, dt_s):
 
 
 @inlined
-def _current_step(i, command, bridge, v, dt_s, loop_decay, loop_mean, limit, loop_s, r, ind, ke, supply):
+def _current_step(
+    i: float,
+    command: float,
+    bridge: int,
+    v: float,
+    dt_s: float,
+    loop_decay: float,
+    loop_mean: float,
+    limit: float,
+    loop_s: float,
+    r: float,
+    ind: float,
+    ke: float,
+    supply: float,
+) -> tuple[float, float]:
     """Return (current after, mean current over) `dt_s`: L di/dt = u - R i - Ke v, (3).
 
     An ideal PI loop holds u such that the current follows its command with time constant `loop_s`
@@ -235,7 +252,15 @@ def _current_step(i, command, bridge, v, dt_s, loop_decay, loop_mean, limit, loo
 
 
 @inlined
-def half_step(s, q, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_bridge):
+def half_step(
+    s: Record,
+    q: Record,
+    dt_s: float,
+    macro_command_a: float,
+    micro_command_a: float,
+    macro_bridge: int,
+    micro_bridge: int,
+) -> None:
     """Drift to the middle of the substep and take motor forces and contact geometry there."""
     if q.draws_noise != 0.0:
         _draw_noise(s, q)
@@ -301,7 +326,7 @@ def half_step(s, q, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_
 
 
 @inlined
-def _stop_force(x, v, low, high, stiffness, damping):
+def _stop_force(x: float, v: float, low: float, high: float, stiffness: float, damping: float) -> float:
     """Push of a hard stop on a body at x: zero between `low` and `high`, never pulling."""
     if x > high:
         return -max(stiffness * (x - high) + damping * v, 0.0)
@@ -311,13 +336,13 @@ def _stop_force(x, v, low, high, stiffness, damping):
 
 
 @inlined
-def contact_stiffness(s, q):
+def contact_stiffness(s: Record, q: Record) -> float:
     """Return the stiffness of the side that touches."""
     return q.right_stiffness_n_per_m if s.contact_side > 0.0 else q.left_stiffness_n_per_m
 
 
 @inlined
-def joint_force(s, q, contact_effects_n):
+def joint_force(s: Record, q: Record, contact_effects_n: float) -> float:
     """Return the force of spring, damping, contact and stroke stops on the end at the middle, opposite on the macro."""
     relative_m = s.middle_end_position_m - s.middle_macro_position_m
     relative_m_per_s = s.middle_end_velocity_m_per_s - s.middle_macro_velocity_m_per_s
@@ -337,7 +362,7 @@ def joint_force(s, q, contact_effects_n):
 
 
 @inlined
-def base_force(s, q):
+def base_force(s: Record, q: Record) -> float:
     """Return the force of the base on the macro at the middle motion: K1 and the travel's stops."""
     stop_n = _stop_force(
         s.middle_macro_position_m,
@@ -351,7 +376,9 @@ def base_force(s, q):
 
 
 @inlined
-def full_step(s, q, dt_s, macro_effects_n, micro_effects_n, contact_effects_n):
+def full_step(
+    s: Record, q: Record, dt_s: float, macro_effects_n: float, micro_effects_n: float, contact_effects_n: float
+) -> None:
     """Kick with all forces of the middle, then drift to the end of the substep."""
     macro_n = s.macro_force_n + s.macro_disturbance_n + macro_effects_n + base_force(s, q)
     old_macro_m = s.macro_position_m

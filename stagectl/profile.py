@@ -325,6 +325,52 @@ class Profile(Document):
         """Return the axes that this stage has."""
         return ("macro",) if self.micro is None else ("macro", "micro")
 
+    def motion_force_n(self, axis: AxisName) -> float:
+        """Return what the profile's motion asks of one drive at most: what it moves, accelerated or braked.
+
+        The macro carries the micro; the micro moves itself, at rest against the macro.
+        """
+        macro = self.macro
+        moved_kg = self.axis(axis).mass_kg
+        if axis == "macro" and self.micro is not None:
+            moved_kg += self.micro.mass_kg
+        braked_m_per_s2 = macro.stop_deceleration_m_per_s2 if macro.stop == "ramp" else 0.0
+        return moved_kg * max(macro.acceleration_limit_m_per_s2, braked_m_per_s2)
+
+    @property
+    def limp_deceleration_m_per_s2(self) -> float | None:
+        """Return the hardest braking of the macro at which a limp micro keeps off its stops; None without a micro.
+
+        Work of the braking from the middle of the gap to the stop = energy of contact and spring there. Damping, and
+        a shorted winding, only make it milder; the worse of both directions counts.
+        """
+        micro, joint = self.micro, self.backlash
+        if micro is None or joint is None:
+            return None
+        middle_m = 0.5 * (joint.left_m - joint.right_m)  # end minus macro; the spring rests at 0
+        sides = (
+            (micro.stroke_m[1], middle_m, joint.left_m, joint.left_stiffness_n_per_m),
+            (-micro.stroke_m[0], -middle_m, joint.right_m, joint.right_stiffness_n_per_m),
+        )
+        return min(
+            (
+                stiffness_n_per_m * max(stop_m - edge_m, 0.0) ** 2
+                + micro.spring_n_per_m * (stop_m * stop_m - begin_m * begin_m)
+            )
+            / (2.0 * micro.mass_kg * (stop_m - begin_m))
+            for stop_m, begin_m, edge_m, stiffness_n_per_m in sides
+        )
+
+    def with_force_limits(self, limits_n: dict[AxisName, float]) -> "Profile":
+        """Return the profile with force limits of some axes lowered to what their drives allow."""
+        update: dict[str, Axis] = {}
+        for name, limit_n in limits_n.items():
+            axis = self.axis(name)
+            if limit_n < axis.force_limit_n:
+                lowered = {"force_limit_n": limit_n, "thermal_force_n": min(axis.thermal_force_n, limit_n)}
+                update[name] = axis.model_copy(update=lowered)
+        return self.model_copy(update=update) if update else self
+
     def eds_path(self, axis: AxisName) -> Path:
         """Return the EDS file of one axis: beside the profile, else where profiles are looked for."""
         name = self.axis(axis).eds

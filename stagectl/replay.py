@@ -17,9 +17,9 @@ from drivers.wire import Inbox, WireDecoder
 from stagectl.errors import RecordError
 from stagectl.fields import fields
 from stagectl.plant import PLANT_PARAMETERS
-from stagectl.profile import Profile
-from stagectl.record import Run, read_run
+from stagectl.record import SNAPSHOT, Run, read_run
 from stagectl.requests import TICKING, Phase
+from stagectl.runs import profile_of
 from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT
 from stagectl.tracker import Tracker
 
@@ -72,11 +72,16 @@ def replay(folder: str | Path) -> Comparison:
 def replay_run(run: Run) -> Comparison:
     """Replay a run that was read."""
     manifest = run.manifest
-    if "mappings" not in manifest or run.snapshot is None:
+    if "mappings" not in manifest or not run.snapshot:
         raise RecordError(
-            f"{run.folder}: the run has no raw bytes to start from (imported table or value seam); nothing to replay"
+            f"{run.folder}: the run has no raw bytes to start from (imported table, value seam, or a lost "
+            f"{SNAPSHOT}); nothing to replay"
         )
-    profile = Profile.model_validate(manifest["profile"])
+    if not run.rows.size:
+        raise RecordError(
+            f"{run.folder}: the run has no rows, so nothing to replay; `stagectl runs show` says how it ended"
+        )
+    profile = profile_of(run)
     mappings = {axis: mapping_of(table) for axis, table in manifest["mappings"].items()}
     decoder = WireDecoder(profile, mappings)
     decoder.restore(run.snapshot)

@@ -1,85 +1,33 @@
-"""The report of a run: one HTML page that needs nothing beside it, and the figures on it.
+"""The report of a run: one HTML page that needs nothing beside it. What is drawn on it stands in `figures`.
 
-Takes plain numbers and arrays; knows no run folder. Readable on a phone, on paper, in light and dark schemes.
+Takes plain numbers and pictures; knows no run folder. Readable on a phone, on paper, in light and dark schemes.
 """
 
 import base64
 import html
-import io
 import math
 import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import matplotlib
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure as Drawing
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from stagectl.errors import RecordError, RequestError
-from stagectl.metrics import cumulative_rms, timing_statistics
 
-_INK, _MUTED, _GRID = "#1b1f24", "#5b6570", "#dde2e8"
-_SERIES = ("#d55e00", "#0072b2", "#009e73", "#aa4499")
+INK, MUTED, GRID = "#1b1f24", "#5b6570", "#dde2e8"
+SERIES = ("#d55e00", "#0072b2", "#009e73", "#aa4499")
 """Okabe and Ito's colours, told apart by every kind of colour vision; the first is the rival, the second ours."""
 
-_POINT = "#7f8894"
-"""Grey of measured points; they are drawn as pixels, so it has to do on light and on dark."""
-
 _PAGE_COLOURS = {  # colour in the drawing: (name on the page, the same in the dark scheme)
-    _INK: ("ink", "#e8ebef"),
-    _MUTED: ("muted", "#a3adb8"),
-    _GRID: ("grid", "#343b44"),
-    _SERIES[0]: ("series-1", "#ff9248"),
-    _SERIES[1]: ("series-2", "#5ab4ee"),
-    _SERIES[2]: ("series-3", "#35c9a0"),
-    _SERIES[3]: ("series-4", "#e38fd0"),
+    INK: ("ink", "#e8ebef"),
+    MUTED: ("muted", "#a3adb8"),
+    GRID: ("grid", "#343b44"),
+    SERIES[0]: ("series-1", "#ff9248"),
+    SERIES[1]: ("series-2", "#5ab4ee"),
+    SERIES[2]: ("series-3", "#35c9a0"),
+    SERIES[3]: ("series-4", "#e38fd0"),
 }
 
-_STYLE: Any = {
-    "font.family": "sans-serif",
-    "font.size": 9.5,
-    "text.color": _INK,
-    "text.parse_math": False,  # a dollar sign in a name is a dollar sign
-    "axes.edgecolor": _MUTED,
-    "axes.labelcolor": _INK,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "grid.color": _GRID,
-    "grid.linewidth": 0.6,
-    "xtick.color": _MUTED,
-    "ytick.color": _MUTED,
-    "xtick.labelcolor": _INK,
-    "ytick.labelcolor": _INK,
-    "xtick.major.size": 3.0,
-    "ytick.major.size": 3.0,
-    "legend.frameon": False,
-    "legend.fontsize": 9.0,
-    "legend.handlelength": 1.4,
-    "lines.linewidth": 1.1,
-    "lines.solid_joinstyle": "round",
-    "svg.fonttype": "none",  # words stay words: searchable, and in the page's own font
-    "svg.hashsalt": "stagectl",
-    "axes.unicode_minus": True,
-}
-
-_WIDTH_IN = 6.2
-_PIXELS_PER_INCH = 200
-_LINE_BINS_COUNT = 800
-_CURVE_POINTS_COUNT = 500
-_POINTS_MAX_COUNT = 8000
 _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n", -12: "p"}
 _PREFIXED_UNITS = ("m", "s", "N", "Hz", "N/m", "A", "V", "m/s", "m/s²")
 
@@ -105,9 +53,9 @@ class Quantity:
             power = powers[0]
         elif scalable and self.value != 0.0:
             # Rounded first: 999.6 nm is 1.00 µm, not 1000 nm.
-            rounded = float(f"{self.value:.{self.digits - 1}e}")
-            power = min(max(3 * math.floor(math.log10(abs(rounded)) / 3.0), -12), 9)
-        number = _plain(self.value / 10.0**power, self.digits)
+            shown = float(f"{self.value:.{self.digits - 1}e}")
+            power = min(max(3 * math.floor(math.log10(abs(shown)) / 3.0), -12), 9)
+        number = rounded(self.value / 10.0**power, self.digits)
         return number if self.unit == "1" else f"{number} {_PREFIXES[power]}{self.unit}"
 
 
@@ -164,405 +112,17 @@ class Report:
             raise RecordError(f"report {file}: {error}; free some space or choose another folder") from error
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorTrace:
-    """Error of one law over time, shapes (n,): the true end position's, and the interferometer's beside it."""
-
-    label: str
-    t_s: np.ndarray
-    true_m: np.ndarray
-    measured_m: np.ndarray | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class HoldTrace:
-    """Error of one law while the reference stands still, shape (n,)."""
-
-    label: str
-    error_m: np.ndarray
-    dt_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class BacklashCurve:
-    """Backlash on macro minus end: no force between -left and right, a spring beyond; half widths are 95 %."""
-
-    left_m: float
-    right_m: float
-    left_stiffness_n_per_m: float
-    right_stiffness_n_per_m: float
-    left_half_width_m: float = math.nan
-    right_half_width_m: float = math.nan
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """One parameter while it is identified, shapes (n,), nan before the first estimate; `true_value` where known."""
-
-    label: str
-    unit: str
-    t_s: np.ndarray
-    value: np.ndarray
-    half_width: np.ndarray
-    true_value: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class TimeSeries:
-    """Times of one kind, one a cycle, shape (n,)."""
-
-    label: str
-    time_ns: np.ndarray
-
-
-def tracking_figure(
-    t_s: np.ndarray, reference_m: np.ndarray, traces: Sequence[ErrorTrace], image_format: str = "svg"
-) -> bytes:
-    """Reference above, errors of all laws below on one pair of axes; measured errors pale behind the true ones.
-
-    Where one law is far better than another a third panel shows the same again, enlarged to the better one.
-    """
-    with matplotlib.rc_context(_STYLE):
-        peaks_m = [float(np.max(np.abs(trace.true_m))) for trace in traces]
-        enlarged = max(peaks_m) > 3.0 * min(peaks_m)
-        ratios = (1.0, 2.0, 1.6) if enlarged else (1.0, 2.2)
-        drawing, panels = _panels(1.9 + 0.75 * sum(ratios), len(ratios), 1, sharex=True, height_ratios=ratios)
-        panels[0].plot(*_envelope(t_s, np.asarray(reference_m) * 1e3), color=_INK)
-        panels[0].set_ylabel("reference (mm)")
-        for axes, largest_m in zip(panels[1:], (max(peaks_m), min(peaks_m)), strict=False):
-            scale, unit = (1e9, "nm") if max(peaks_m) < 10e-6 else (1e6, "µm")
-            _errors(axes, traces, scale)
-            axes.axhline(0.0, color=_MUTED, linewidth=0.6)
-            axes.set_ylabel(f"error ({unit})")
-            # Room for what the interferometer adds to the better law's error.
-            axes.set_ylim(-1.25 * largest_m * scale or -1.0, 1.25 * largest_m * scale or 1.0)
-        if enlarged:
-            panels[2].set_ylabel(panels[1].get_ylabel() + ",\nenlarged")
-        panels[-1].set_xlabel("time (s)")
-        panels[-1].set_xlim(float(t_s[0]), float(t_s[-1]))
-        drawing.align_ylabels()
-        _legend(drawing, panels[1], columns=2)
-        return _image(drawing, image_format)
-
-
-def _errors(axes: Axes, traces: Sequence[ErrorTrace], scale: float) -> None:
-    """Draw all measured errors, then all true ones on top."""
-    for trace, colour in zip(traces, _colours(traces), strict=True):
-        if trace.measured_m is not None:
-            t, error = _envelope(trace.t_s, np.asarray(trace.measured_m) * scale)
-            axes.plot(t, error, color=colour, linewidth=0.6, alpha=0.30)
-    for trace, colour in zip(traces, _colours(traces), strict=True):
-        true_m = np.asarray(trace.true_m)
-        peak, rms = Quantity(float(np.max(np.abs(true_m))), "m"), Quantity(float(np.sqrt(np.mean(true_m**2))), "m")
-        t, error = _envelope(trace.t_s, true_m * scale)
-        axes.plot(t, error, color=colour, label=f"{trace.label}: peak {peak}, rms {rms}")
-    if any(trace.measured_m is not None for trace in traces):
-        axes.plot([], [], color=_MUTED, linewidth=4.0, alpha=0.35, label="pale: as the interferometer measured it")
-
-
-def hold_figure(holds: Sequence[HoldTrace], image_format: str = "svg") -> bytes:
-    """Error while holding: how it is distributed, and from which frequencies its rms comes."""
-    with matplotlib.rc_context(_STYLE):
-        drawing, (left, right) = _panels(2.75, 1, 2)
-        span = 1e9 * max(float(np.max(np.abs(hold.error_m))) for hold in holds) or 1.0  # an ideal rig holds at 0
-        bins = np.linspace(-span, span, 62)
-        for hold, colour in zip(holds, _colours(holds), strict=True):
-            error = np.asarray(hold.error_m) * 1e9
-            share = 100.0 * np.histogram(error, bins)[0] / error.size
-            left.stairs(share, bins, color=colour, alpha=0.18, fill=True)
-            rms = Quantity(float(np.sqrt(np.mean(np.asarray(hold.error_m) ** 2))), "m")
-            left.stairs(share, bins, color=colour, linewidth=1.1, label=f"{hold.label}: {rms} rms")
-            spectrum = cumulative_rms(hold.error_m, hold.dt_s)
-            frequency_hz, cumulative = _by_decade(spectrum.frequency_hz, spectrum.cumulative_rms_m * 1e9)
-            right.plot(frequency_hz, cumulative, color=colour, drawstyle="steps-post")
-        left.set_xlabel("error of the end (nm)")
-        left.set_ylabel("samples per bin (%)")
-        left.set_ylim(bottom=0.0)
-        right.set_xscale("log")
-        right.set_xlabel("frequency (Hz)")
-        right.set_ylabel("cumulative rms (nm)")
-        right.set_ylim(bottom=0.0)
-        right.margins(x=0.0)
-        _plain_log(right.xaxis)
-        _legend(drawing, left, columns=2)
-        return _image(drawing, image_format)
-
-
-def backlash_figure(
-    macro_minus_end_m: np.ndarray,
-    contact_force_n: np.ndarray,
-    identified: BacklashCurve,
-    true: BacklashCurve | None = None,
-    image_format: str = "svg",
-) -> bytes:
-    """Contact force over macro minus end: the points that were measured, and the identified law through them."""
-    with matplotlib.rc_context(_STYLE):
-        drawing, (axes,) = _panels(3.5, 1, 1)
-        offset, force_n = np.asarray(macro_minus_end_m) * 1e6, np.asarray(contact_force_n)
-        stride = max(1, math.ceil(offset.size / _POINTS_MAX_COUNT))
-        axes.plot(
-            offset[::stride],
-            force_n[::stride],
-            ".",
-            color=_POINT,
-            markersize=2.4,
-            alpha=0.45,
-            markeredgewidth=0,
-            rasterized=True,
-        )
-        axes.plot([], [], "o", color=_POINT, markersize=3.5, label="contact force from the balance of the micro")
-        left_edge, right_edge = -identified.left_m * 1e6, identified.right_m * 1e6
-        low, high = min(float(np.min(offset)), left_edge), max(float(np.max(offset)), right_edge)
-        corners = np.array([low, left_edge, right_edge, high])
-        law_n = [
-            identified.left_stiffness_n_per_m * (low - left_edge) * 1e-6,
-            0.0,
-            0.0,
-            identified.right_stiffness_n_per_m * (high - right_edge) * 1e-6,
-        ]
-        axes.plot(corners, law_n, color=_SERIES[1], linewidth=1.6, label="identified")
-        axes.plot([left_edge, right_edge], [0.0, 0.0], "o", color=_SERIES[1], markersize=4.5)
-        true_left_m, true_right_m = (true.left_m, true.right_m) if true else (None, None)
-        true_left_k, true_right_k = (
-            (true.left_stiffness_n_per_m, true.right_stiffness_n_per_m) if true else (None, None)
-        )
-        _edge(axes, left_edge, identified.left_m, identified.left_half_width_m, true_left_m, "left edge", -1)
-        _edge(axes, right_edge, identified.right_m, identified.right_half_width_m, true_right_m, "right edge", 1)
-        _slope(axes, 0.02, identified.left_stiffness_n_per_m, true_left_k)
-        _slope(axes, 0.98, identified.right_stiffness_n_per_m, true_right_k)
-        axes.set_xlabel("macro minus end (µm)")
-        axes.set_ylabel("contact force (N)")
-        _legend(drawing, axes, columns=2)
-        return _image(drawing, image_format)
-
-
-def convergence_figure(estimates: Sequence[Estimate], image_format: str = "svg") -> bytes:
-    """Each parameter as it is identified, with its 95 % band; the true value dashed where it is known."""
-    with matplotlib.rc_context(_STYLE):
-        rows = math.ceil(len(estimates) / 2)
-        drawing, panels = _panels(0.6 + 1.75 * rows, rows, 2, sharex=True)
-        for axes, estimate in zip(panels, estimates, strict=False):
-            t, value, half = (np.asarray(a, dtype=float) for a in (estimate.t_s, estimate.value, estimate.half_width))
-            shown = np.linspace(0, t.size - 1, min(t.size, _CURVE_POINTS_COUNT)).astype(int)
-            t, value, half = t[shown], value[shown], half[shown]
-            axes.fill_between(t, value - half, value + half, color=_SERIES[1], alpha=0.22, linewidth=0.0)
-            axes.plot(t, value, color=_SERIES[1])
-            if estimate.true_value is not None:
-                axes.axhline(estimate.true_value, color=_SERIES[0], linestyle=(0, (4, 2)), linewidth=1.1)
-            axes.set_title(f"{_with_band(value[-1], half[-1])} {estimate.unit}")
-            axes.set_ylabel(f"{estimate.label} ({estimate.unit})")
-            axes.set_ylim(*_settled_range(value, half, estimate.true_value))
-            axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-            axes.set_xlim(float(t[0]), float(t[-1]))
-        for axes in panels[len(estimates) :]:
-            axes.set_visible(False)
-        for axes in panels[max(len(estimates) - 2, 0) : len(estimates)]:
-            axes.set_xlabel("time (s)")
-            axes.tick_params(labelbottom=True)
-        names = [
-            ("identified", {"color": _SERIES[1]}),
-            ("95 % band", {"color": _SERIES[1], "alpha": 0.3, "linewidth": 6.0}),
-        ]
-        if any(estimate.true_value is not None for estimate in estimates):
-            names.append(("true (rig)", {"color": _SERIES[0], "linestyle": (0, (4, 2))}))
-        handles = [Line2D([], [], label=name, **look) for name, look in names]
-        drawing.legend(handles=handles, loc="outside upper left", ncols=3, borderaxespad=0.2)
-        return _image(drawing, image_format)
-
-
-def timing_figure(series: Sequence[TimeSeries], deadline_ns: int | None = None, image_format: str = "svg") -> bytes:
-    """How long things took, both axes logarithmic, so that one late cycle in a million is seen."""
-    with matplotlib.rc_context(_STYLE):
-        drawing, (axes,) = _panels(2.9 + 0.17 * len(series), 1, 1)
-        floor_us = 0.1  # below it no clock of ours tells times apart; earlier and zero count there
-        columns_us = [np.maximum(np.asarray(one.time_ns) * 1e-3, floor_us) for one in series]
-        low_us = min(float(column.min()) for column in columns_us)
-        high_us = max(float(column.max()) for column in columns_us)
-        if deadline_ns is not None:
-            high_us = max(high_us, deadline_ns * 1e-3)
-        bins_us = np.geomspace(low_us / 1.2, high_us * 1.2, 90)
-        for one, column_us, colour in zip(series, columns_us, _colours(series), strict=True):
-            count = np.histogram(column_us, bins_us)[0]
-            times = timing_statistics(one.time_ns, deadline_ns)
-            figures = ", ".join(
-                f"{name} {_plain(value * 1e-3, 3)}"
-                for name, value in (
-                    ("p50", times.p50_ns),
-                    ("p99", times.p99_ns),
-                    ("p99.9", times.p999_ns),
-                    ("max", times.max_ns),
-                )
-            )
-            axes.stairs(count, bins_us, color=colour, fill=True, alpha=0.18, baseline=0.5)
-            axes.stairs(count, bins_us, color=colour, linewidth=1.1, baseline=0.5, label=f"{one.label}: {figures} µs")
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_ylim(0.5, axes.get_ylim()[1] * (5.0 if deadline_ns is not None else 1.5))
-        _plain_log(axes.xaxis)
-        _plain_log(axes.yaxis)
-        if deadline_ns is not None:
-            axes.axvline(deadline_ns * 1e-3, color=_INK, linewidth=0.9, linestyle=(0, (4, 2)))
-            axes.annotate(
-                f"deadline {Quantity(deadline_ns * 1e-9, 's')}",
-                (deadline_ns * 1e-3, 0.97),
-                xycoords=("data", "axes fraction"),
-                xytext=(-4, 0),
-                textcoords="offset points",
-                ha="right",
-                va="top",
-                fontsize=9.0,
-            )
-        axes.set_xlabel("time (µs)")
-        axes.set_ylabel("cycles per bin")
-        _legend(drawing, axes, columns=1)
-        return _image(drawing, image_format)
-
-
-def _panels(
-    height_in: float, rows: int, columns: int, sharex: bool = False, height_ratios: Sequence[float] | None = None
-) -> tuple[Drawing, list[Axes]]:
-    """An empty drawing and its axes, row by row."""
-    drawing = Drawing(figsize=(_WIDTH_IN, height_in), layout="constrained")
-    grid = drawing.subplots(rows, columns, sharex=sharex, squeeze=False, gridspec_kw={"height_ratios": height_ratios})
-    return drawing, list(grid.flat)
-
-
-def _image(drawing: Drawing, image_format: str) -> bytes:
-    """Render as SVG without background, or as PNG on white."""
-    if image_format not in ("svg", "png"):
-        raise RequestError(f"image_format is {image_format!r}; 'svg' or 'png' is needed")
-    stream = io.BytesIO()
-    if image_format == "png":
-        FigureCanvasAgg(drawing).print_figure(stream, format="png", dpi=_PIXELS_PER_INCH, facecolor="white")
-    else:
-        drawing.savefig(stream, format="svg", dpi=_PIXELS_PER_INCH, transparent=True, metadata={"Date": None})
-    return stream.getvalue()
-
-
-def _colours(things: Sequence[object]) -> list[str]:
-    """One colour for each; a single one gets ours."""
-    return [_SERIES[1]] if len(things) == 1 else [_SERIES[i % len(_SERIES)] for i in range(len(things))]
-
-
-def _envelope(t_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thin a long line to the smallest and largest value of each pixel: no peak is lost."""
-    t_s, values = np.asarray(t_s), np.asarray(values)
-    width = t_s.size // _LINE_BINS_COUNT
-    if width < 3:
-        return t_s, values
-    count = t_s.size // width * width
-    blocks = values[:count].reshape(-1, width)
-    first = np.arange(len(blocks)) * width
-    extremes = np.sort(np.stack([first + blocks.argmin(axis=1), first + blocks.argmax(axis=1)], axis=1), axis=1).ravel()
-    kept = np.unique(np.concatenate([[0], extremes, np.arange(count, t_s.size), [t_s.size - 1]]))
-    return t_s[kept], values[kept]
-
-
-def _by_decade(frequency_hz: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thin a long spectrum evenly in the logarithm of the frequency; it rises, so nothing between is lost."""
-    if frequency_hz.size <= _LINE_BINS_COUNT:
-        return frequency_hz, values
-    wanted = np.geomspace(frequency_hz[0], frequency_hz[-1], _LINE_BINS_COUNT)
-    kept = np.unique(np.minimum(np.searchsorted(frequency_hz, wanted), frequency_hz.size - 1))
-    return frequency_hz[kept], values[kept]
-
-
-def _settled_range(value: np.ndarray, half: np.ndarray, true_value: float | None) -> tuple[float, float]:
-    """Limits that show the last two thirds whole and let the start run off the panel."""
-    good = np.flatnonzero(np.isfinite(value) & np.isfinite(half))
-    if good.size == 0:
-        return -1.0, 1.0
-    late = good[good.size // 3 :]
-    low, high = float(np.min(value[late] - half[late])), float(np.max(value[late] + half[late]))
-    if true_value is not None:
-        low, high = min(low, true_value), max(high, true_value)
-    margin = 0.25 * (high - low) or 0.01 * abs(high) or 1.0
-    return low - margin, high + margin
-
-
-def _edge(
-    axes: Axes, at: float, edge_m: float, half_width_m: float, true_m: float | None, name: str, side: int
-) -> None:
-    """Mark an identified edge of the gap and say its value."""
-    axes.axvline(at, color=_SERIES[1], linewidth=0.8, linestyle=(0, (4, 2)))
-    lines = [name, f"{_with_band(edge_m * 1e6, half_width_m * 1e6)} µm"]
-    if true_m is not None:
-        lines.append(f"true {true_m * 1e6:.2f} µm")
-    # Inside the gap, where no point can be: the force is zero there.
-    height, va = (0.97, "top") if side < 0 else (0.03, "bottom")
-    axes.annotate(
-        "\n".join(lines),
-        (at, height),
-        xycoords=("data", "axes fraction"),
-        xytext=(-6 * side, 0),
-        textcoords="offset points",
-        ha="left" if side < 0 else "right",
-        va=va,
-        fontsize=9.0,
-        linespacing=1.35,
-    )
-
-
-def _slope(axes: Axes, across: float, stiffness_n_per_m: float, true_n_per_m: float | None) -> None:
-    """Say a contact's stiffness in the corner that its line leaves free."""
-    text = f"{stiffness_n_per_m * 1e-3:.2f} N/mm"
-    if true_n_per_m is not None:
-        text += f"\ntrue {true_n_per_m * 1e-3:.2f} N/mm"
-    left = across < 0.5
-    axes.text(
-        across,
-        0.97 if left else 0.03,
-        text,
-        transform=axes.transAxes,
-        ha="left" if left else "right",
-        va="top" if left else "bottom",
-        fontsize=9.0,
-        linespacing=1.35,
-    )
-
-
-def _legend(drawing: Drawing, axes: Axes, columns: int) -> None:
-    """Put the legend of `axes` on top of the whole drawing, in the order drawn, row by row."""
-    handles, labels = axes.get_legend_handles_labels()
-    # Matplotlib fills column by column.
-    order = [i for column in range(columns) for i in range(column, len(labels), columns)]
-    drawing.legend(
-        [handles[i] for i in order],
-        [labels[i] for i in order],
-        loc="outside upper left",
-        ncols=min(columns, len(labels)),
-        borderaxespad=0.2,
-        borderpad=0.1,
-        columnspacing=1.6,
-    )
-
-
-def _plain_log(axis: Axis) -> None:
-    """Decades as plain numbers."""
-    axis.set_major_locator(LogLocator(10.0, numticks=12))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.12g}".replace(",", "\u2009")))
-    axis.set_minor_formatter(NullFormatter())
-
-
-def _plain(value: float, digits: int) -> str:
+def rounded(value: float, digits: int) -> str:
     """Round to significant digits without an exponent."""
     if not math.isfinite(value):
         return "–"
     if value == 0.0:
         return "0"
-    rounded = float(f"{value:.{digits - 1}e}")
-    decimals = max(digits - 1 - math.floor(math.log10(abs(rounded))), 0)
+    near = float(f"{value:.{digits - 1}e}")
+    decimals = max(digits - 1 - math.floor(math.log10(abs(near))), 0)
     if decimals > 9:
-        return f"{rounded:.{digits - 1}e}"
-    return f"{rounded:.{decimals}f}".replace("-", "\u2212")
-
-
-def _with_band(value: float, half_width: float) -> str:
-    """Round a value to the digits that its 95 % half width leaves it."""
-    if not (math.isfinite(half_width) and half_width > 0.0):
-        return f"{value:.2f}"
-    decimals = max(1 - math.floor(math.log10(half_width)), 0)
-    return f"{value:.{decimals}f} ± {half_width:.{decimals}f}"
+        return f"{near:.{digits - 1}e}"
+    return f"{near:.{decimals}f}".replace("-", "\u2212")
 
 
 def _table_html(table: Table) -> str:

@@ -78,6 +78,7 @@ STATUS = np.dtype(
         ("micro_statusword", "i8"),
         ("macro_counts", "f8"),
         ("end_counts", "f8"),
+        ("air_index_ratio", "f8"),  # in use
         ("macro_position_m", "f8"),
         ("end_position_m", "f8"),
         ("macro_encoder_m", "f8"),

@@ -5,6 +5,7 @@ Pure; knows no file and no clock.
 """
 
 import hashlib
+from typing import Any
 
 import numpy as np
 
@@ -51,11 +52,11 @@ ESTIMATES = (
 """What estimators and law believe; nan where nothing estimates it."""
 
 
-def _scalars(dtype: np.dtype, prefix: str = "") -> list[tuple]:
+def _scalars(dtype: np.dtype, prefix: str = "") -> list[tuple[Any, ...]]:
     return [(prefix + name, dtype[name]) for name in dtype.names or ()]
 
 
-def _frame(name: str) -> list[tuple]:
+def _frame(name: str) -> list[tuple[Any, ...]]:
     return [(name, "u1", (FRAME_BYTES_COUNT,)), (f"{name}_count", "i8")]
 
 

@@ -63,6 +63,7 @@ _STATED = (
     "discarded_bytes",
     "macro_counts",
     "end_counts",
+    "air_index_ratio",
 )
 """What the loop itself adds to the status."""
 

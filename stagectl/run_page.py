@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import savgol_filter
 
-from stagectl import report
-from stagectl.profile import Profile
+from stagectl import figures, report
+from stagectl.figures import BacklashCurve, ErrorTrace, Estimate, HoldTrace, TimeSeries
 from stagectl.record import Run
-from stagectl.report import BacklashCurve, ErrorTrace, Estimate, Figure, HoldTrace, Quantity, Table, TimeSeries
+from stagectl.report import Figure, Quantity, Table
 from stagectl.run_scores import (
     SETTLING_WINDOW_M,
     BacklashScore,
@@ -23,7 +23,8 @@ from stagectl.run_scores import (
     score_motion,
     segments,
 )
-from stagectl.signals import STOP_TEXT
+from stagectl.runs import ending, profile_of
+from stagectl.signals import Stop
 
 _BALANCE_WINDOW_S = 0.015  # acceleration from 15 samples: 5 nm of noise come to 0.05 N for a micro of 40 kg
 _NORMAL_95 = 1.96
@@ -57,7 +58,7 @@ def scores_of(run: Run, truth: dict[str, np.ndarray] | None) -> Scores:
         motions=tuple(score_motion(run, segment, truth) for segment in last_finished(found)),
         backlash=score_backlash(run, truth),
         cycles=score_cycles(run),
-        ended_early=tuple(f"{one.name}: {STOP_TEXT[one.stop]}" for one in found if not one.finished),
+        ended_early=tuple(one.text for one in found if not one.finished),
     )
 
 
@@ -80,7 +81,7 @@ def _banner(run: Run, scores: Scores) -> str:
     else:
         banner = _MEASURED_BANNER
     if scores.ended_early:
-        banner += " Ended before its time: " + "; ".join(scores.ended_early) + "."
+        banner += f" Ended before its time: {'. '.join(scores.ended_early)}."
     return banner
 
 
@@ -97,6 +98,9 @@ def _facts(run: Run, scores: Scores) -> list[tuple[str, str]]:
         facts.append(("Cycle", str(Quantity(float(profile["cycle"]["rate_hz"]), "Hz"))))
     if manifest.get("profile_sha256"):
         facts.append(("Profile's hash", str(manifest["profile_sha256"])[:12]))
+    stop, text = ending(manifest)
+    if stop not in ("", Stop.NONE.name, Stop.FINISHED.name):
+        facts.append(("Ended", text))
     trajectories = {motion.segment.trajectory for motion in scores.motions}
     if trajectories:
         facts.append(("Trajectory", ", ".join(sorted(trajectories))))
@@ -256,10 +260,11 @@ def _tracking_pictures(motions: tuple[MotionScore, ...]) -> list[Picture]:
         of_it = [motion for motion in motions if motion.segment.trajectory == trajectory]
         traces = [_trace(motion) for motion in of_it]
         longest = max(of_it, key=lambda motion: motion.t_s.size)
-        caption = "Reference of the end, and how far the end was from it."
+        caption = "Reference of the end, and how far the end was from it"
+        caption += "." if all(motion.true_error_m is not None for motion in of_it) else ", as measured."
         if len(of_it) > 1:
             caption += " The same reference, one after the other."
-        draw = Draw(report.tracking_figure, longest.t_s, longest.reference_m, traces)
+        draw = Draw(figures.tracking_figure, longest.t_s, longest.reference_m, traces)
         made.append(Picture(f"tracking-{trajectory}", f"Tracking error, {trajectory}", caption, draw))
     return made
 
@@ -279,13 +284,14 @@ def _hold_pictures(motions: tuple[MotionScore, ...]) -> list[Picture]:
     for motion in motions:
         error_m = _trace(motion).true_m[motion.hold]
         if error_m.size:
-            holds.append(HoldTrace(_label(motion, motions), error_m, motion.period_s))
+            holds.append(HoldTrace(_label(motion, motions), error_m, motion.period_s, motion.true_error_m is not None))
     if not holds:
         return []
-    is_true = all(motion.true_error_m is not None for motion in motions)
     caption = "The last rest, from 0.2 s after the reference stopped: how the error is distributed, and from which "
-    caption += "frequencies its rms comes. " + ("True position." if is_true else "As measured.")
-    return [Picture("hold", "Holding still", caption, Draw(report.hold_figure, holds))]
+    caption += "frequencies its rms comes. " + (
+        "True position." if all(hold.is_true for hold in holds) else "As measured."
+    )
+    return [Picture("hold", "Holding still", caption, Draw(figures.hold_figure, holds))]
 
 
 def _backlash_pictures(run: Run, score: BacklashScore) -> list[Picture]:
@@ -300,13 +306,13 @@ def _backlash_pictures(run: Run, score: BacklashScore) -> list[Picture]:
         caption += (
             "is what the estimator in the loop identified while the stage moved. The loop is the contact's damping."
         )
-        draw = Draw(report.backlash_figure, *balance, identified, true)
+        draw = Draw(figures.backlash_figure, *balance, identified, true)
         made.append(Picture("backlash", "The joint, identified", caption, draw))
     estimates = _estimates(score)
     if estimates:
         caption = "The estimator in the loop while the micro sweeps both edges; "
         caption += "its band holds noise, no error of the profile."
-        made.append(Picture("convergence", "Identification", caption, Draw(report.convergence_figure, estimates)))
+        made.append(Picture("convergence", "Identification", caption, Draw(figures.convergence_figure, estimates)))
     return made
 
 
@@ -327,7 +333,7 @@ def _curve(score: BacklashScore, value, with_band: bool) -> BacklashCurve:
 
 def _contact_points(run: Run, score: BacklashScore) -> tuple[np.ndarray, np.ndarray] | None:
     """Balance the micro at every sample: (macro minus end, force that the joint must have carried)."""
-    profile = Profile.model_validate(run.manifest["profile"])
+    profile = profile_of(run)
     micro, period_s = profile.micro, profile.cycle.period_s
     window = 2 * round(0.5 * _BALANCE_WINDOW_S / period_s) + 1
     rows = score.rows
@@ -390,4 +396,4 @@ def _timing_picture(score: CycleScore) -> Picture:
             TimeSeries("wake-up behind its instant", score.lateness_ns),
         ]
     caption = "Every cycle with power on; the dashed line is one period."
-    return Picture("timing", "Timing", caption, Draw(report.timing_figure, series, score.period_ns))
+    return Picture("timing", "Timing", caption, Draw(figures.timing_figure, series, score.period_ns))

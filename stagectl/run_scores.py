@@ -5,6 +5,7 @@ Motions are found by the events that the supervisor wrote; the demo, `run` and `
 
 import itertools
 import re
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +13,11 @@ import numpy as np
 
 from stagectl.errors import RecordError
 from stagectl.metrics import Errors, Settling, Timing, error_statistics, settling, timing_statistics
-from stagectl.profile import Profile
-from stagectl.record import Run
+from stagectl.record import EVENTS, Run
 from stagectl.requests import Phase
+from stagectl.runs import profile_of
 from stagectl.scoring import Scored, score
-from stagectl.signals import SETPOINT, Stop
+from stagectl.signals import SETPOINT, Stop, stop_sentence
 
 TRUTH_FILE = "truth.npz"
 """What really happened, beside the run that it belongs to; only the scoring reads it."""
@@ -46,11 +47,17 @@ class Segment:
     first_row: int
     rows_count: int
     stop: Stop
+    detail: str = ""  # where, the value, its limit and the remedy, of a stop that has them
 
     @property
     def finished(self) -> bool:
         """Whether it came to its own end."""
         return self.stop is Stop.FINISHED
+
+    @property
+    def text(self) -> str:
+        """The sentence for the operator."""
+        return f"{self.name}: {stop_sentence(self.stop, self.detail)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +131,10 @@ def read_truth(folder: Path) -> dict[str, np.ndarray] | None:
     try:
         with np.load(path, allow_pickle=False) as content:
             return {name: content[name] for name in content.files}
-    except (OSError, EOFError, ValueError) as error:
-        raise RecordError(f"{path}: can't be read: {error}; the run itself is whole: move this file away") from error
+    except OSError as error:
+        raise RecordError(f"{path}: can't be read: {error.strerror}; the run itself is whole") from error
+    except (EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise RecordError(f"{path}: is damaged or not ours; the run itself is whole: move this file away") from error
 
 
 def write_truth(folder: Path, truth: dict[str, np.ndarray], joint) -> None:
@@ -144,12 +153,22 @@ def write_truth(folder: Path, truth: dict[str, np.ndarray], joint) -> None:
 
 
 def segments(run: Run) -> list[Segment]:
-    """Find every motion of a run, in order; one that the run's end cut off counts as not finished."""
+    """Find every motion of a run, in order; one that the run's end cut off counts as not finished.
+
+    Errors: RecordError where an event does not say what it should.
+    """
     found = []
     rows = run.rows
     armed = rows["run_phase"] == int(Phase.TRACKING)
     for begin, end in _pairs(run):
-        number, name = int(begin["number"]), str(begin["segment"])
+        try:
+            number, name, setpoints = int(begin["number"]), str(begin["segment"]), int(begin["setpoints"])
+            stop = Stop[end["stop"]] if end else Stop.OPERATOR
+        except (KeyError, ValueError, TypeError) as error:
+            raise RecordError(
+                f"{run.folder / EVENTS}: motion {begin.get('segment')!r}: its events say {error}, or lack it; "
+                "use the version that made the run"
+            ) from error
         of_it = np.flatnonzero(armed & (rows["segment_number"] == number))
         if not of_it.size:
             continue
@@ -157,19 +176,19 @@ def segments(run: Run) -> list[Segment]:
         trajectory, law = (match["trajectory"], match["law"]) if match else ("", "")
         # Rows behind the last setpoint only hold; a missed cycle has no row, and the reference goes on by cycles.
         cycles = rows["cycle"][of_it] - rows["cycle"][of_it[0]]
-        count = int(np.count_nonzero(cycles < int(begin["setpoints"])))
-        found.append(Segment(name, trajectory, law, int(of_it[0]), count, Stop[end] if end else Stop.OPERATOR))
+        count = int(np.count_nonzero(cycles < setpoints))
+        found.append(Segment(name, trajectory, law, int(of_it[0]), count, stop, str(end.get("detail", ""))))
     return found
 
 
-def _pairs(run: Run) -> list[tuple[dict, str]]:
-    """Return every motion's first event with the name of the Stop that ended it, empty where none is recorded."""
-    pairs: list[tuple[dict, str]] = []
+def _pairs(run: Run) -> list[tuple[dict, dict]]:
+    """Return every motion's first event with the one that ended it, empty where none is recorded."""
+    pairs: list[tuple[dict, dict]] = []
     for event in run.events:
         if event.get("event") == "segment":
-            pairs.append((event, ""))
+            pairs.append((event, {}))
         elif event.get("event") == "segment_end" and pairs:
-            pairs[-1] = (pairs[-1][0], str(event["stop"]))
+            pairs[-1] = (pairs[-1][0], event)
     return pairs
 
 
@@ -181,7 +200,7 @@ def last_finished(all_segments: list[Segment]) -> list[Segment]:
 
 def score_motion(run: Run, segment: Segment, truth: dict[str, np.ndarray] | None) -> MotionScore:
     """Score one motion along a trajectory."""
-    profile = Profile.model_validate(run.manifest["profile"])
+    profile = profile_of(run)
     scored = _joined(run, truth, segment) if truth is not None else None
     rows = run.rows[segment.first_row : segment.first_row + segment.rows_count]
     skipped = _lead_in(rows, profile.cycle.rate_hz)

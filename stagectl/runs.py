@@ -14,17 +14,29 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from pydantic import ValidationError
 
 from stagectl.errors import RecordError, RequestError
-from stagectl.record import SAMPLES, Run, free_text, read_batches, read_manifest, read_run, recorded_fields
+from stagectl.profile import Profile
+from stagectl.record import MANIFEST, SAMPLES, Run, free_text, read_batches, read_manifest, read_run, recorded_fields
 from stagectl.row import ROW
 from stagectl.samples_file import schema_of, to_batch
-from stagectl.signals import STOP_TEXT, Stop
+from stagectl.signals import Stop, stop_sentence
 from stagectl.suggestion import closest
 from stagectl.table_import import Imported, import_table
 from stagectl.whole_file import is_held
 
-__all__ = ["Imported", "RunSummary", "export", "import_table", "list_runs", "new_run_folder", "show"]
+__all__ = [
+    "Imported",
+    "RunSummary",
+    "ending",
+    "export",
+    "import_table",
+    "list_runs",
+    "new_run_folder",
+    "profile_of",
+    "show",
+]
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _MAT_VARIABLE_LIMIT_BYTES = 2**31 - 1  # MATLAB 5 format: the size of a variable is a 32-bit number
@@ -58,12 +70,20 @@ class RunSummary:
     duration_s: float
     profile: str
     stop: str
+    """Name of the Stop that ended it; empty where none is recorded."""
+    text: str
+    """The same as a sentence with its numbers; empty where nothing is known."""
     note: str = ""
 
 
 def list_runs(root: Path) -> list[RunSummary]:
-    """Summarise every run folder under `root`, oldest first; a damaged run is listed and raises nothing."""
+    """Summarise every run folder under `root`, oldest first; a damaged run is listed and raises nothing.
+
+    Errors: RequestError where `root` is a file.
+    """
     root = Path(root)
+    if root.is_file():
+        raise RequestError(f"{root}: is a file, and runs lie in a folder; give that folder")
     if not root.is_dir():
         return []
     folders = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
@@ -75,12 +95,8 @@ def _summary(folder: Path) -> RunSummary:
         manifest = read_manifest(folder)
         record = manifest.get("record", {})
         state = record.get("state", "")
-        count, first_t_ns, last_t_ns, stop = (
-            record.get("rows_count", 0),
-            record.get("first_t_ns"),
-            record.get("last_t_ns"),
-            _stop_text(manifest),
-        )
+        count, first_t_ns, last_t_ns = record.get("rows_count", 0), record.get("first_t_ns"), record.get("last_t_ns")
+        stop, text = ending(manifest)
         if state == "recording":
             state = "recording" if is_held(folder / SAMPLES) else "crashed"
             count = 0
@@ -89,9 +105,9 @@ def _summary(folder: Path) -> RunSummary:
                 last_t_ns = int(rows["t_ns"][-1])
                 count += len(rows)
     except RecordError as error:
-        return RunSummary(folder, "damaged", 0, 0.0, "", "", str(error))
+        return RunSummary(folder, "damaged", 0, 0.0, "", "", "", str(error))
     duration_s = 0.0 if first_t_ns is None or last_t_ns is None else (last_t_ns - first_t_ns) * 1e-9
-    return RunSummary(folder, state, count, duration_s, _profile_name(manifest), stop)
+    return RunSummary(folder, state, count, duration_s, _profile_name(manifest), stop, text)
 
 
 def _profile_name(manifest: dict) -> str:
@@ -99,11 +115,31 @@ def _profile_name(manifest: dict) -> str:
     return str(profile.get("name", "")) if isinstance(profile, dict) else str(profile)
 
 
-def _stop_text(manifest: dict) -> str:
-    """Return the sentence for how the run ended; the manifest's `end.stop` is a Stop number or a text."""
+def ending(manifest: dict) -> tuple[str, str]:
+    """Return how a run ended: the Stop's name, and the sentence with its numbers; empty where it doesn't say.
+
+    The manifest's `end` has `stop` (a Stop's name or number) with its `detail`, or the `error` that ended it.
+    """
     end = manifest.get("end", {})
-    stop = end.get("stop", end.get("error", ""))
-    return STOP_TEXT[Stop(stop)] if isinstance(stop, int) and 0 <= stop < len(Stop) else str(stop)
+    stop, error = end.get("stop", ""), str(end.get("error", ""))
+    if isinstance(stop, int) and 0 <= stop < len(Stop):
+        stop = Stop(stop).name
+    known = Stop.__members__.get(str(stop))
+    if known is None or (known is Stop.NONE and error):
+        return str(stop), error
+    return known.name, stop_sentence(known, str(end.get("detail", "")))
+
+
+def profile_of(run: Run) -> Profile:
+    """Return the profile that a run was made with. Errors: RecordError where this version can't read it."""
+    try:
+        return Profile.model_validate(run.manifest["profile"])
+    except (KeyError, ValidationError) as error:
+        first = str(error).splitlines()[0]
+        made_by = f"stagectl {run.manifest.get('version', 'of that time')}"
+        raise RecordError(
+            f"{run.folder / MANIFEST}: the profile in it can't be read by this version: {first}; use {made_by}"
+        ) from error
 
 
 def show(folder: Path) -> dict[str, Any]:
@@ -116,6 +152,7 @@ def show(folder: Path) -> dict[str, Any]:
         "state": summary.state,
         "profile": summary.profile,
         "stop": summary.stop,
+        "text": summary.text,
         "rows_count": len(rows),
         "duration_s": float((rows["t_ns"][-1] - rows["t_ns"][0]) * 1e-9) if len(rows) else 0.0,
         "truncated": run.truncated,

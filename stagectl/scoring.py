@@ -10,9 +10,9 @@ import numpy as np
 
 from drivers.wire import WireDecoder
 from stagectl.errors import RecordError
-from stagectl.profile import Profile
 from stagectl.record import Run
 from stagectl.replay import mapping_of
+from stagectl.runs import profile_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class Scored:
 def score(run: Run, truth: dict[str, np.ndarray], first_row: int, rows_count: int) -> Scored:
     """Join rows and truth by the sensor's sequence number; RecordError where the truth lacks a row's sample."""
     rows = run.rows[first_row : first_row + rows_count]
-    profile = Profile.model_validate(run.manifest["profile"])
+    profile = profile_of(run)
     mappings = {axis: mapping_of(table) for axis, table in run.manifest["mappings"].items()}
     decoder = WireDecoder(profile, mappings)
     place = np.searchsorted(truth["sequence"], rows["cycle"])

@@ -631,6 +631,7 @@ class Servo:
             self._rows, int(self.phase), int(self.stop), self._segment_number,
             self._segment_rows - self._segment_row, self._update_number, int(ready), self._missed,
             decoder.samples_lost, decoder.framer.counters.bytes_discarded, decoder.macro_counts, decoder.end_counts,
+            decoder.air_index,
         )  # fmt: skip
         if self.text != self._stated_text:
             self._stated_text = self.text

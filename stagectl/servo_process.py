@@ -1,9 +1,9 @@
 """The servo as a process: `python -m stagectl.servo_process`, started and fed by the supervisor over stdin.
 
-First line in: the profile; the process compiles or loads every tick, and answers `{"warm": true}`. Second line: bus,
-port, mappings and shared memory; it opens them, makes itself as real-time as the host allows, and runs until asked to
-exit. When its supervisor is gone it first brings the stage to rest and takes the power away, and only then, no longer
-cyclic, saves what the ring still holds.
+First line in: the profile; the process compiles or loads every tick, and answers `{"warm": true}`. Second line: the
+profile as the drives allow it, bus, port, mappings and shared memory; it opens them, makes itself as real-time as the
+host allows, and runs until asked to exit. When its supervisor is gone it first brings the stage to rest and takes the
+power away, and only then, no longer cyclic, saves what the ring still holds.
 """
 
 import ctypes
@@ -113,7 +113,7 @@ def _warm(profile: Profile) -> None:
         )  # fmt: skip
     fill_status(
         status, one.measurement, tracker.setpoint, tracker.hold, one.backlash,
-        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0,
+        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0, 1.0,
     )  # fmt: skip
     tracker.begin(0)
     tracker.guide()
@@ -144,8 +144,9 @@ def _rehearse(profile: Profile, mappings: dict, segments: np.ndarray) -> None:
         servo.cycle()
 
 
-def _serve(profile: Profile, config: dict[str, Any]) -> int:
+def _serve(config: dict[str, Any]) -> int:
     """Open bus, port and memory, and run the loop."""
+    profile = profile_from_effective(config["profile"], "the supervisor's profile")  # a drive may have been capped
     mappings = {axis: mapping_of(table) for axis, table in config["mappings"].items()}
     segments = np.memmap(config["segments"], dtype=SETPOINT, mode="r")
     _rehearse(profile, mappings, segments)  # before the port is open: its buffer would fill with old lines
@@ -210,7 +211,7 @@ def main() -> int:
         line = sys.stdin.readline()
         if not line:
             return 0
-        return _serve(profile, json.loads(line))
+        return _serve(json.loads(line))
     except StagectlError as error:
         _say({"error": str(error), "kind": type(error).__name__})
         return 3

@@ -6,8 +6,12 @@ Pure; knows no bus and no clock.
 """
 
 from enum import IntEnum
+from typing import Any, TypeAlias
 
 import numpy as np
+
+Record: TypeAlias = Any
+"""One element of a structured array in compiled code: its fields are attributes, which no type checker can see."""
 
 MACRO = 0
 MICRO = 1
@@ -68,7 +72,7 @@ COMMAND = np.dtype(
 
 
 class Stop(IntEnum):
-    """Why a run ended; `STOP_TEXT` holds the sentence for the operator."""
+    """Why a run ended; `stop_sentence` says it to the operator."""
 
     NONE = 0
     FINISHED = 1
@@ -94,10 +98,11 @@ class Stop(IntEnum):
     LINK_LOST = 21
     HEARTBEAT_LOST = 22
     RECORD_LOST = 23
+    SAMPLE_AHEAD = 24
 
 
 STOP_TEXT = {
-    Stop.NONE: "the run goes on",
+    Stop.NONE: "nothing stopped it",
     Stop.FINISHED: "the reference came to its end",
     Stop.OPERATOR: "the operator asked to stop",
     Stop.TRAVEL: "the stage left its allowed travel",
@@ -121,7 +126,13 @@ STOP_TEXT = {
     Stop.LINK_LOST: "the bus or the interferometer's port is gone, or speaks another layout",
     Stop.HEARTBEAT_LOST: "a drive sends no heartbeat",
     Stop.RECORD_LOST: "the run can't be written to its disk",
+    Stop.SAMPLE_AHEAD: "the newest interferometer sample lies in the future",
 }
+
+
+def stop_sentence(stop: Stop, detail: str) -> str:
+    """Say why a run ended, with place, value, limit and remedy where `detail` has them."""
+    return f"{STOP_TEXT[stop]}: {detail}" if detail else STOP_TEXT[stop]
 
 
 def new(dtype: np.dtype) -> np.ndarray:

@@ -10,6 +10,9 @@ from drivers import cia402
 from stagectl.guard import NEGATIVE_LIMIT, POSITIVE_LIMIT, PRESSURE_LOW, SAFE_TORQUE_OFF
 from stagectl.signals import Stop
 
+_AWAY = {NEGATIVE_LIMIT: "positive", POSITIVE_LIMIT: "negative"}
+"""The direction that leads off a switch; none where both are pressed."""
+
 _INPUTS = {
     NEGATIVE_LIMIT: "negative limit switch",
     POSITIVE_LIMIT: "positive limit switch",
@@ -77,6 +80,14 @@ def _age(m: Any, now: Any, g: Any) -> str:
     )
 
 
+def _ahead(m: Any, now: Any, g: Any) -> str:
+    ahead_ms = (int(m["sample_t_ns"]) - int(m["t_ns"])) * 1e-6
+    return (
+        f"newest sample {m['sequence']} is {ahead_ms:.3f} ms ahead of its cycle, "
+        f"limit {g['sensor_ahead_ns'] * 1e-6:g} ms; check interferometer.rate_hz and transport_s, and the host's clock"
+    )
+
+
 def _overrun(m: Any, now: Any, g: Any) -> str:
     return (
         f"cycle {m['cycle']} began {m['overrun_ns'] * 1e-6:.1f} ms late, limit {g['overrun_ns'] * 1e-6:g} ms; "
@@ -100,6 +111,7 @@ _OF_MOTION = {
     Stop.FOLLOWING_ERROR: _following,
     Stop.MICRO_STROKE: _stroke,
     Stop.SENSOR_AGE: _age,
+    Stop.SAMPLE_AHEAD: _ahead,
     Stop.OVERRUN: _overrun,
     Stop.THERMAL: _thermal,
     Stop.MEASUREMENT_NOT_FINITE: _not_finite,
@@ -107,7 +119,7 @@ _OF_MOTION = {
 
 
 def _force(command: Any, g: Any) -> str:
-    beyond = []
+    beyond: list[str] = []
     for axis in ("macro", "micro"):
         asked_n, limit_n = float(command[f"{axis}_force_asked_n"]), float(g[f"{axis}_force_limit_n"])
         if limit_n > 0.0 and not abs(asked_n) <= limit_n:
@@ -118,7 +130,8 @@ def _force(command: Any, g: Any) -> str:
 def _drives(stop: Stop, m: Any, g: Any, node_ids: dict[str, int]) -> str:
     if stop is Stop.EMERGENCY:
         return emergency_detail(int(m["emergency"]))
-    said = []
+    said: list[str] = []
+    remedy = _REMEDIES[stop]
     for axis, node_id in node_ids.items():
         name = f"{axis} (node {node_id})"
         word = int(m[f"{axis}_statusword"])
@@ -128,13 +141,16 @@ def _drives(stop: Stop, m: Any, g: Any, node_ids: dict[str, int]) -> str:
             tripped = [text for bit, text in _INPUTS.items() if bits & bit]
             if tripped:
                 said.append(f"{name}: {', '.join(tripped)} (0x60FD = 0x{bits:X})")
+            away = _AWAY.get(bits & (NEGATIVE_LIMIT | POSITIVE_LIMIT))
+            if away is not None:
+                remedy = f"take the power away, move the {axis} off the switch by hand in {away} direction, acknowledge"
         elif stop is Stop.LINK_SILENT:
             cycles, limit = int(g[f"{axis}_silence"]), int(g["silent_cycles"])
             if cycles > limit:
                 said.append(f"{name}: nothing for {cycles} cycles, limit {limit}")
         elif state is not cia402.State.OPERATION_ENABLED:
             said.append(f"{name} is in {state.name}, statusword 0x{word:04X}")
-    return f"{'; '.join(said)}; {_REMEDIES[stop]}" if said else _REMEDIES[stop]
+    return f"{'; '.join(said)}; {remedy}" if said else remedy
 
 
 _REMEDIES = {

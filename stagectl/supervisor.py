@@ -14,32 +14,39 @@ from typing import Any
 import numpy as np
 
 from drivers import cia402
-from drivers.arming import DriveMapping, DriveSettings, configure
+from drivers.arming import DriveMapping, DriveSettings, StaleTorque, configure
 from drivers.canopen_master import Master
 from stagectl import trajectory as trajectories
 from stagectl.backend import SEGMENT_ROWS, Backend, ServoLink
 from stagectl.errors import DriveError, LinkError, RecordError, RequestError, StagectlError, TimingError
 from stagectl.plant import PLANT_PARAMETERS
-from stagectl.profile import Profile
+from stagectl.profile import AxisName, Profile
 from stagectl.record import Recorder
 from stagectl.replay import describe_mapping
 from stagectl.requests import RESTING, Mode, Phase
-from stagectl.signals import SETPOINT, STOP_TEXT, Stop
+from stagectl.signals import SETPOINT, STOP_TEXT, Stop, stop_sentence
+from stagectl.touch_sweep import (
+    IDENTIFY_HZ,
+    IDENTIFY_SHARE,
+    TOUCH_HZ,
+    TOUCH_S,
+    TOUCH_SHARE,
+    Joint,
+    contact_damping_n_s_per_m,
+    plan,
+)
 from stagectl.tracker import LAW_NAMES
 from stagectl.undisturbed import undisturbed
 
 _STEP_S = 0.02
 _SENSOR_TIMEOUT_S = 5.0
 _INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
-_TOUCH_FREQUENCY_HZ = 0.7
-_TOUCH_S = 6.0
-_TOUCH_SHARE = 0.6  # of the touch force that the sweep aims at: the edges are not known yet
 _TOUCH_TRIES = 4
-_SWEEP_SHARE = 0.8
 _JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
 _PLAN_SHARE = 0.9  # of the profile's limits that planned moves use
 _JERK_TIME_S = 0.1
 _QUICK_STOP_HOLD, _QUICK_STOP_OFF = 6, 2
+_STALE_SHARE = 1.0 / 3.0  # of the micro's way to a stop that each drive may use up before it misses a dead servo
 _RESET_TIMEOUT_S = 2.0
 _HEARTBEATS_MISSED = 2  # looks in a row that find a heartbeat too old
 _FAULTS = (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE)
@@ -91,7 +98,7 @@ class Outcome:
     @property
     def text(self) -> str:
         """The sentence for the operator."""
-        return f"{STOP_TEXT[self.stop]}: {self.detail}" if self.detail else STOP_TEXT[self.stop]
+        return stop_sentence(self.stop, self.detail)
 
     @property
     def finished(self) -> bool:
@@ -99,21 +106,21 @@ class Outcome:
         return self.stop is Stop.FINISHED
 
 
-def drive_settings(profile: Profile, vendor_id: int | None) -> dict[str, DriveSettings]:
+def drive_settings(profile: Profile, vendor_id: int | None) -> dict[AxisName, DriveSettings]:
     """Say what each drive must be and do."""
-    settings = {}
+    settings: dict[AxisName, DriveSettings] = {}
     for axis_name in profile.axes:
         axis = profile.axis(axis_name)
         is_macro = axis_name == "macro"
         step_m = getattr(axis, "encoder_step_m", None)
-        vendor = axis.identity.vendor_id if vendor_id is None else vendor_id
-        product = axis.identity.product_code if vendor_id is None else None
+        asked = axis.identity
+        own = (asked.vendor_id, asked.product_code, asked.revision_number, asked.serial_number)
         ramp = profile.macro.stop_deceleration_m_per_s2 / (step_m or profile.macro.encoder_step_m)
         hold = profile.macro.standstill == "hold"
         settings[axis_name] = DriveSettings(
             node_id=axis.node_id,
             eds_path=str(profile.eds_path(axis_name)),
-            identity=(vendor, product),
+            identity=own if vendor_id is None else (vendor_id,),  # the rig plays whatever unit the profile names
             mode=profile.macro.mode if is_macro else "torque",
             rated_torque_word=round(axis.rated_force_n * 1e3),
             max_torque_word=round(axis.force_limit_n / axis.rated_force_n * 1e3),
@@ -121,11 +128,26 @@ def drive_settings(profile: Profile, vendor_id: int | None) -> dict[str, DriveSe
             quick_stop_option=_QUICK_STOP_HOLD if is_macro and hold else _QUICK_STOP_OFF,
             heartbeat_ms=round(profile.trip.heartbeat_s * 1e3),
             rpdo_deadline_ms=round(profile.trip.rpdo_deadline_s * 1e3),
+            stale_torque=_stale_torque(profile, axis_name),
             cycle_us=round(1e6 / profile.cycle.rate_hz),
             rated_current_word=round(axis.rated_current_a * 1e3),
             encoder_step_m=step_m if is_macro else None,
         )
     return settings
+
+
+def _stale_torque(profile: Profile, axis: AxisName) -> StaleTorque | None:
+    """Say what may become of the micro while a drive keeps up a dead servo's torque; None on a stage without one.
+
+    The macro's force moves the macro alone away from a limp micro; the micro's acts on both, one against the other.
+    """
+    macro, micro = profile.macro, profile.micro
+    if micro is None:
+        return None
+    both_kg = macro.mass_kg * micro.mass_kg / (macro.mass_kg + micro.mass_kg)
+    way_m = _STALE_SHARE * min(-micro.stroke_m[0], micro.stroke_m[1])
+    needed_n = min(profile.motion_force_n(axis), profile.axis(axis).force_limit_n)
+    return StaleTorque(macro.mass_kg if axis == "macro" else both_kg, way_m, needed_n)
 
 
 class Supervisor:
@@ -155,20 +177,23 @@ class Supervisor:
         self._holds_lease = False
         self._watches = False
         self._heartbeats_missed: dict[str, int] = {}
+        self._heartbeat_ages_s: dict[str, float] = {}
         self._reason = ""  # why this side asked the servo to stop
         self._trouble: StagectlError | None = None  # raised as soon as the stage rests
         self.mappings: dict[str, DriveMapping] = {}
+        self.remarks: list[str] = []
+        """What the operator should know of this arming, in words."""
 
     def __enter__(self) -> "Supervisor":
         try:
             self.connect()
-        except BaseException:
-            self._close(quiet=True)
+        except BaseException as error:
+            self._close(error)
             raise
         return self
 
     def __exit__(self, kind, error, trace) -> None:
-        self._close(quiet=error is not None)
+        self._close(error)
 
     # ---- parts -----------------------------------------------------------------------------------------------
 
@@ -250,6 +275,7 @@ class Supervisor:
             for emergency in self.master.emergencies():
                 self._event("emergency", node_id=emergency.node_id, code=emergency.code, text=str(emergency))
             ages_s = {axis: self.master.heartbeat_age_s(mapping.node_id) for axis, mapping in self.mappings.items()}
+            self._heartbeat_ages_s = ages_s
         except LinkError as error:
             self._watches = False
             self._distress(Stop.LINK_LOST, str(error), error)
@@ -262,13 +288,23 @@ class Supervisor:
                 self._event("heartbeat_back", axis=axis, node_id=node_id)
             elif missed + 1 == _HEARTBEATS_MISSED and not age_s <= limit_s:
                 self._event("heartbeat_lost", axis=axis, node_id=node_id, age_s=age_s)
-        lost = [axis for axis, missed in self._heartbeats_missed.items() if missed >= _HEARTBEATS_MISSED]
-        if lost:
-            said = [f"{axis} (node {self.mappings[axis].node_id}): {ages_s[axis] * 1e3:.0f} ms ago" for axis in lost]
-            self._distress(
-                Stop.HEARTBEAT_LOST,
-                f"the last of {', '.join(said)}, limit {limit_s * 1e3:g} ms; check the drive's power and firmware",
-            )
+        if self._heartless():
+            self._distress(Stop.HEARTBEAT_LOST, self._heartbeat_detail())
+
+    def _heartless(self) -> list[str]:
+        """Name the axes whose drives send no heartbeat."""
+        return [axis for axis, missed in self._heartbeats_missed.items() if missed >= _HEARTBEATS_MISSED]
+
+    def _heartbeat_detail(self) -> str:
+        """Say whose heartbeat is missing and since when; empty where none is."""
+        if not self._heartless():
+            return ""
+        ages = [
+            f"{axis} (node {self.mappings[axis].node_id}): {self._heartbeat_ages_s[axis] * 1e3:.0f} ms ago"
+            for axis in self._heartless()
+        ]
+        limit_ms = self.profile.trip.heartbeat_s * 1e3
+        return f"the last of {', '.join(ages)}, limit {limit_ms:g} ms; check the drive's power and firmware"
 
     def _wait(self, done: Callable[[np.void], bool], timeout_s: float, what: str, share: float = 0.0) -> np.void:
         """Pump until `done`; a servo that stopped by itself ends the wait too; TimingError after the timeout."""
@@ -291,13 +327,15 @@ class Supervisor:
 
     def connect(self) -> None:
         """Configure and read back the drives, start the servo, wait for sensor and process data."""
-        profile = self.profile
+        backend = self.backend
         self._progress("configuring the drives", 0.0)
-        master = Master(self.backend.network_bus(), synchronous=self.backend.synchronous, clock_s=self.backend.clock_s)
+        master = Master(backend.network_bus(), backend.synchronous, backend.clock_s, backend.pause)
         self._master = master
-        settings = drive_settings(profile, self.backend.vendor_id)
-        found = configure(master, list(settings.values()))
+        settings = drive_settings(self.profile, backend.vendor_id)
+        found = configure(master, list(settings.values()), self._remark)
         self.mappings = dict(zip(settings, found, strict=True))
+        # What a drive was capped to is what laws, guard, plans and replay go by from here on.
+        profile = self.profile = self.profile.with_force_limits(self._force_limits_n(settings))
         manifest = {
             **self._manifest,
             "profile": profile.effective(),
@@ -316,10 +354,25 @@ class Supervisor:
         self._request(mode=int(Mode.IDLE))
         self._event("connected", backend=self.backend.name, profile=profile.name)
         for remark in self.backend.remarks:
+            self._remark(remark)
+        for remark in self.remarks:
             self._event("remark", text=remark)
-            self._progress(remark, 0.0)
         self._await_sensor()
         self._watches = True
+
+    def _remark(self, text: str) -> None:
+        """Keep what the operator should know, and say it at once."""
+        self.remarks.append(text)
+        self._progress(text, 0.0)
+
+    def _force_limits_n(self, settings: dict[AxisName, DriveSettings]) -> dict[AxisName, float]:
+        """Return the limits of the drives that arming capped below what the profile asked for."""
+        limits_n: dict[AxisName, float] = {}
+        for axis, drive in settings.items():
+            word = self.master.read(drive.node_id, cia402.MAX_TORQUE, 0)
+            if word < drive.max_torque_word:
+                limits_n[axis] = word * self.profile.axis(axis).torque_step_n
+        return limits_n
 
     def _await_sensor(self) -> np.void:
         """Wait until the sensor's clock is locked; LinkError says what the interferometer lacks."""
@@ -328,7 +381,7 @@ class Supervisor:
         except TimingError as error:
             raise LinkError(self._sensor_text()) from error
         if not status["sensor_ready"]:
-            raise LinkError(f"{STOP_TEXT[Stop(int(status['stop']))]}: {self.detail}")
+            raise LinkError(stop_sentence(Stop(int(status["stop"])), self.detail))
         return status
 
     def _sensor_text(self) -> str:
@@ -373,7 +426,7 @@ class Supervisor:
         """Enable both drives and hold where the stage is; returns why not, NONE when it holds."""
         if self.status()["phase"] == Phase.TRACKING:
             return Stop.NONE
-        if any(missed >= _HEARTBEATS_MISSED for missed in self._heartbeats_missed.values()):
+        if self._heartless():
             return Stop.HEARTBEAT_LOST
         self._holds_lease = True
         self._reason = ""
@@ -383,6 +436,14 @@ class Supervisor:
         self.pump()
         status = self._wait(lambda s: s["phase"] == Phase.TRACKING, 5.0, "enabling the drives")
         return Stop(int(status["stop"]))
+
+    def armed(self, law: str | None = None) -> Outcome:
+        """Enable like `enable`; FINISHED where the stage holds, else why it doesn't."""
+        first_row = self.recorder.rows_count
+        stop = self.enable(law)
+        if stop is Stop.HEARTBEAT_LOST:  # refused: the servo did not even hear of it
+            return Outcome("enable", stop, first_row, 0, detail=self._heartbeat_detail())
+        return self._outcome("enable", Stop.FINISHED if stop is Stop.NONE else stop, first_row)
 
     def disarm(self) -> Stop:
         """Bring the stage to rest under the law, then take the power away."""
@@ -432,29 +493,32 @@ class Supervisor:
 
     def close(self) -> None:
         """Rest, power off, rows to disk; lets go of everything whatever fails, and raises what failed."""
-        self._close(quiet=False)
+        self._close(None)
 
-    def _close(self, quiet: bool) -> None:
-        """Close; `quiet` where an error is under way already that says more than what follows from it."""
+    def _close(self, under_way: BaseException | None) -> None:
+        """Close; an error that is under way already says more than what follows from it, and stands in the run."""
         link, recorder, master = self._link, self._recorder, self._master
         self._master = None
         with contextlib.ExitStack() as stack:
             stack.callback(self.backend.close)
             if master is not None:
                 stack.callback(master.close)
-            if recorder is not None and link is None:
-                stack.callback(recorder.abandon)
+            asked = Stop.OPERATOR if isinstance(under_way, KeyboardInterrupt) else Stop.NONE
+            end: dict[str, Any] = {"stop": asked.name, "text": STOP_TEXT[asked]}
+            if isinstance(under_way, StagectlError):
+                end["error"] = f"{type(under_way).__name__}: {under_way}"
+            if recorder is not None and link is None:  # no servo, so no row that could be missing
+                stack.callback(recorder.close, end)
             if recorder is not None and link is not None:
-                end: dict[str, Any] = {"stop": Stop.NONE.name, "text": STOP_TEXT[Stop.NONE]}
                 stack.callback(self._end_run, link, recorder, end)
-                self._rest(end, quiet)
+                self._rest(end, asked, quiet=under_way is not None)
 
-    def _rest(self, end: dict[str, Any], quiet: bool) -> None:
-        """Bring the stage to rest and fill in how the run ended."""
+    def _rest(self, end: dict[str, Any], asked: Stop, quiet: bool) -> None:
+        """Bring the stage to rest and fill in how the run ended; `asked` where nothing else stopped it."""
         self._watches = False
         try:
             detail = self.detail
-            stop = self.disarm()
+            stop = self.disarm() or asked
             self.pump(0.1)
             end.update(stop=stop.name, text=STOP_TEXT[stop], detail=detail)
             status = self.status()
@@ -497,9 +561,9 @@ class Supervisor:
         self._publish_update(macro_zero, end_zero)
         estimate = None
         if self.profile.micro is not None:
-            stop = self.enable()
-            if stop is not Stop.NONE:
-                return self._outcome("home", stop, first_row)
+            held = self.armed()
+            if not held.finished:
+                return held
             outcome = self._touch()
             estimate = outcome.backlash
             if not outcome.finished or estimate is None:
@@ -515,7 +579,7 @@ class Supervisor:
         says little; the edge that was met says where the other one is.
         """
         for _ in range(_TOUCH_TRIES):
-            outcome = self.sweep(_TOUCH_FREQUENCY_HZ, _TOUCH_S, _TOUCH_SHARE, "touching both edges")
+            outcome = self.sweep(TOUCH_SHARE, TOUCH_HZ, TOUCH_S, "touching both edges")
             estimate = outcome.backlash
             if not outcome.finished or estimate is None or estimate.identifiable:
                 return outcome
@@ -530,7 +594,7 @@ class Supervisor:
             sds = {name: math.inf for name in BacklashEstimate.__dataclass_fields__ if "_sd" in name}
             self.take_backlash(BacklashEstimate(**known, **sds))
         raise DriveError(
-            f"homing: not both edges of the joint were touched in {_TOUCH_TRIES} sweeps at {_TOUCH_SHARE:.0%} of "
+            f"homing: not both edges of the joint were touched in {_TOUCH_TRIES} sweeps at {TOUCH_SHARE:.0%} of "
             "backlash.touch_force_n; check backlash.left_m and right_m, micro.stroke_m and the voice coil"
         )
 
@@ -538,7 +602,8 @@ class Supervisor:
         from drivers.wire import WireDecoder
 
         decoder = WireDecoder(self.profile, self.mappings)
-        return decoder.macro_m_per_count, decoder.end_m_per_count
+        ratio = decoder.air_index / float(self.status()["air_index_ratio"])  # the index in use follows the air
+        return decoder.macro_m_per_count * ratio, decoder.end_m_per_count * ratio
 
     def _homing_method(self) -> int:
         """Return the profile's method; where the index was found before, search towards it (CiA 402, 33 and 34)."""
@@ -610,6 +675,10 @@ class Supervisor:
                 value = setpoints[field][odd[0]]
                 raise RequestError(f"{name}: setpoint {odd[0]} has {field} = {value}; every value must be finite")
         status = self.status()
+        if status["phase"] != Phase.TRACKING and status["stop"] != Stop.NONE:
+            # What came between two parts of a motion (on the way to its start, say) ends it like any other stop.
+            status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "coming to rest")
+            return self._outcome(name, Stop(int(status["stop"])), self.recorder.rows_count)
         if status["phase"] != Phase.TRACKING:
             raise RequestError(f"{name}: the stage is not armed; enable it first")
         away_m = abs(float(setpoints["position_m"][0]) - float(status["setpoint_position_m"]))
@@ -706,26 +775,26 @@ class Supervisor:
             return there
         return self.follow(planned.setpoints, f"{planned.name} under {law}", law)
 
-    def sweep(self, frequency_hz: float, duration_s: float, force_share: float, name: str) -> Outcome:
-        """Let the micro meet both edges, pressing with at most `force_share` of the touch force."""
+    def sweep(
+        self, force_share: float, usual_hz: float, duration_s: float, name: str, asked_hz: float | None = None
+    ) -> Outcome:
+        """Let the micro meet both edges, as `stagectl.touch_sweep.plan` has it for the joint that is believed now."""
         if self.profile.micro is None or self.profile.backlash is None:
             raise RequestError(f"{name}: this stage has no micro; there is no backlash to identify")
         status = self.status()
         self._centre(status)
-        stiffness = max(
-            float(self._belief["left_stiffness_n_per_m"][0]), float(self._belief["right_stiffness_n_per_m"][0])
+        joint = Joint(
+            damping_n_s_per_m=contact_damping_n_s_per_m(self.profile.effects),
+            touch_force_n=self.profile.backlash.touch_force_n,
+            **{name: float(self._belief[name][0]) for name in _JOINT},
         )
-        width_m = float(self._belief["left_m"][0]) + float(self._belief["right_m"][0])
-        press_m = force_share * self.profile.backlash.touch_force_n / stiffness
         planned = trajectories.sweep(
-            0.5 * width_m + press_m,
-            frequency_hz,
-            duration_s,
+            *plan(joint, force_share, usual_hz, duration_s, asked_hz),
             centre_m=float(status["setpoint_position_m"]),
             dt_s=1.0 / self.profile.cycle.rate_hz,
         )
         return self.follow(planned.setpoints, name)
 
-    def identify(self, frequency_hz: float = 1.0, duration_s: float = 20.0) -> Outcome:
-        """Identify the backlash from a sweep over both contacts."""
-        return self.sweep(frequency_hz, duration_s, _SWEEP_SHARE, "identifying the backlash")
+    def identify(self, frequency_hz: float | None = None, duration_s: float = 20.0) -> Outcome:
+        """Identify the backlash from a sweep over both contacts; without a frequency, one that suits the joint."""
+        return self.sweep(IDENTIFY_SHARE, IDENTIFY_HZ, duration_s, "identifying the backlash", frequency_hz)

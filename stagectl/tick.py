@@ -7,7 +7,7 @@ from Python a cycle at a time, or from the compiled loop of `stagectl.batch`. Pu
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from stagectl import backlash, compose, estimator, guard
 from stagectl.compiled import direct
 from stagectl.laws import dsmc, pid
 from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT, new
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 LAWS: dict[str, ModuleType] = {"dsmc": dsmc, "pid": pid}
 """Every law by the name that profiles and commands use."""
@@ -83,6 +86,44 @@ def estimate(m, e, model, ahead, b, q, p):
 
 
 @compiled
+def micro_made(motor_n, a, f, q, t_s, dt_s, p):
+    """Return the force that the micro's motor makes when `motor_n` is asked of it, actuator effects and all."""
+    relative_m = f.middle_end_position_m - f.middle_macro_position_m
+    rate = f.middle_end_velocity_m_per_s - f.middle_macro_velocity_m_per_s
+    return motor_n + forces.micro_actuator(f.middle_end_position_m, f.middle_end_velocity_m_per_s,
+                                           f.end_acceleration_m_per_s2, q.micro_mass_kg, relative_m, rate,
+                                           a.micro_current_a, motor_n, motor_n, t_s, dt_s, f.memory, p)
+
+
+@compiled
+def macro_made(motor_n, a, f, q, felt_n, t_s, dt_s, p):
+    """Return the force that the macro's motor makes when `motor_n` is asked of it and the micro feels `felt_n`."""
+    relative_m = 0.0
+    rate = 0.0
+    if q.has_micro != 0.0:
+        relative_m = f.middle_end_position_m - f.middle_macro_position_m
+        rate = f.middle_end_velocity_m_per_s - f.middle_macro_velocity_m_per_s
+    return motor_n + forces.macro_actuator(f.middle_macro_position_m, f.middle_macro_velocity_m_per_s,
+                                           f.macro_acceleration_m_per_s2, q.macro_mass_kg, relative_m, rate,
+                                           a.macro_current_a, motor_n, felt_n, t_s, dt_s, f.memory, p)
+
+
+@compiled
+def asked_for(force_n, none_n, made_n, limit_n):
+    """Return what to ask so that `force_n` is made: exact where the actuator is a straight line, F / (1 + e).
+
+    `none_n` is made when nothing is asked, `made_n` when `force_n` is. A force that the law cut to what its limit
+    makes comes out at the limit, and rounding must not carry it beyond: the guard stops there.
+    """
+    if force_n == 0.0:
+        return -none_n
+    asked_n = (force_n - none_n) / ((made_n - none_n) / force_n)  # without actuator effects force_n, to the last bit
+    if abs(asked_n) <= limit_n * (1.0 + 1e-12):
+        return reference.limited(asked_n, limit_n)
+    return asked_n
+
+
+@compiled
 def decide(m, now, later, e, ahead, after, l, q, p):
     """Return (macro force, micro force) that the law asks for."""
     a = ahead[0]
@@ -98,6 +139,8 @@ def decide(m, now, later, e, ahead, after, l, q, p):
     relative_m = end_m - macro_m
     rate = end_m_per_s - macro_m_per_s
     micro_n = 0.0
+    felt_n = 0.0
+    macro_limit_n = l[0].macro_force_limit_n
     macro_known_n = plant.base_force(f, q[0])
     if q[0].has_micro != 0.0:
         contact_n = forces.contact(f.penetration_m, f.penetration_velocity_m_per_s, plant.contact_stiffness(f, q[0]),
@@ -107,14 +150,16 @@ def decide(m, now, later, e, ahead, after, l, q, p):
         known_n = joint_n + forces.micro_force(end_m, end_m_per_s, f.end_acceleration_m_per_s2, q[0].micro_mass_kg,
                                                relative_m, rate, a.micro_current_a, a.micro_force_n, a.micro_force_n,
                                                t_s, dt_s, memory, p)
-        micro_n = law.precision(l[0], a, f, x, now, later, q[0].micro_mass_kg, known_n, a.micro_disturbance_n,
-                                q[0], x.period_s)
-        felt_n = micro_n
-        micro_n -= forces.micro_actuator(end_m, end_m_per_s, f.end_acceleration_m_per_s2, q[0].micro_mass_kg,
-                                         relative_m, rate, a.micro_current_a, micro_n, micro_n, t_s, dt_s, memory, p)
+        limit_n = l[0].precision_force_limit_n
+        felt_n = law.precision(l[0], a, f, x, now, later, q[0].micro_mass_kg, known_n, a.micro_disturbance_n,
+                               micro_made(-limit_n, a, f, q[0], t_s, dt_s, p),
+                               micro_made(limit_n, a, f, q[0], t_s, dt_s, p), q[0], x.period_s)
+        micro_n = asked_for(felt_n, micro_made(0.0, a, f, q[0], t_s, dt_s, p),
+                            micro_made(felt_n, a, f, q[0], t_s, dt_s, p), limit_n)
         k = q[0].micro_force_constant_n_per_a
-        micro_n -= k * forces.micro_command_lost(micro_n / k, t_s, dt_s, memory, p)
-        micro_n = reference.limited(micro_n, l[0].precision_force_limit_n)
+        lost_n = k * forces.micro_command_lost(micro_n / k, t_s, dt_s, memory, p)
+        if lost_n != 0.0:  # what is asked besides keeps to the limit; the law's own force is the guard's to judge
+            micro_n = reference.limited(micro_n - lost_n, limit_n)
         macro_known_n -= joint_n
         macro_known_n += forces.macro_force(macro_m, macro_m_per_s, f.macro_acceleration_m_per_s2, q[0].macro_mass_kg,
                                             relative_m, rate, a.macro_current_a, a.macro_force_n, felt_n,
@@ -124,20 +169,25 @@ def decide(m, now, later, e, ahead, after, l, q, p):
             macro_n -= macro_known_n
         else:
             macro_n = law.carrier(l[0], a, f, x, now, later, q[0].macro_mass_kg, macro_known_n,
-                                  a.macro_disturbance_n, q[0], x.period_s)
+                                  a.macro_disturbance_n,
+                                  macro_made(-macro_limit_n, a, f, q[0], felt_n, t_s, dt_s, p),
+                                  macro_made(macro_limit_n, a, f, q[0], felt_n, t_s, dt_s, p), q[0], x.period_s)
             # What differs from the micro's lag: its own inertia and the micro's reaction, carried on at constant jerk.
             macro_n += (q[0].macro_mass_kg + q[0].micro_mass_kg) * later.jerk_m_per_s3 * x.macro_lead_s
     else:
         macro_known_n += forces.macro_force(macro_m, macro_m_per_s, f.macro_acceleration_m_per_s2, q[0].macro_mass_kg,
                                             0.0, 0.0, a.macro_current_a, a.macro_force_n, 0.0, t_s, dt_s, memory, p)
         macro_n = law.precision(l[0], a, f, x, now, later, q[0].macro_mass_kg, macro_known_n, a.macro_disturbance_n,
-                                q[0], x.period_s)
-    macro_n -= forces.macro_actuator(macro_m, macro_m_per_s, f.macro_acceleration_m_per_s2, q[0].macro_mass_kg,
-                                     relative_m, rate, a.macro_current_a, macro_n, micro_n, t_s, dt_s, memory, p)
+                                macro_made(-macro_limit_n, a, f, q[0], felt_n, t_s, dt_s, p),
+                                macro_made(macro_limit_n, a, f, q[0], felt_n, t_s, dt_s, p), q[0], x.period_s)
+    macro_n = asked_for(macro_n, macro_made(0.0, a, f, q[0], felt_n, t_s, dt_s, p),
+                        macro_made(macro_n, a, f, q[0], felt_n, t_s, dt_s, p), macro_limit_n)
     k = q[0].macro_force_constant_n_per_a
-    macro_n -= k * forces.macro_command_lost(macro_n / k, t_s, dt_s, memory, p)
-    if x.position_mode == 0.0:
-        macro_n = reference.limited(macro_n, l[0].macro_force_limit_n)
+    lost_n = k * forces.macro_command_lost(macro_n / k, t_s, dt_s, memory, p)
+    if lost_n != 0.0:
+        macro_n -= lost_n
+        if x.position_mode == 0.0:
+            macro_n = reference.limited(macro_n, macro_limit_n)
     return macro_n, micro_n
 
 
@@ -250,7 +300,7 @@ class Controller:
             getattr(self, name)[...] = snapshot[name]
 
 
-def controller(profile, law_name: str, *, has_drives: bool) -> Controller:
+def controller(profile: "Profile", law_name: str, *, has_drives: bool) -> Controller:
     """Make the controller of a profile under a law, nothing seen yet."""
     effects = [dict(row) for row in profile.effects]
     return Controller(

@@ -4,6 +4,8 @@ The servo calls it live and `stagectl.replay` calls it on recorded rows: whateve
 here, from values that rows and events hold. Pure; knows no bus and no clock.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stagectl import backlash, estimator
@@ -12,13 +14,16 @@ from stagectl.plant import PLANT_PARAMETERS
 from stagectl.signals import SETPOINT, new
 from stagectl.tick import LAWS, Controller, controller
 
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
+
 LAW_NAMES = tuple(LAWS)
 
 
 class Tracker:
     """Shares measurement, estimator, guard and belief between the laws; only `law` differs."""
 
-    def __init__(self, profile, *, has_drives: bool):
+    def __init__(self, profile: "Profile", *, has_drives: bool):
         """Compile or load the tick of every law, nothing seen yet."""
         self._profile = profile
         self._has_drives = has_drives

@@ -20,10 +20,21 @@ from stagectl.record import Recorder
 from stagectl.requests import Phase
 from stagectl.row import new_rows
 from stagectl.run_scores import SWEEP_NAME, VALUE_SEAM, write_truth
-from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT, Stop
+from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT, STOP_TEXT, Stop, stop_sentence
+from stagectl.stop_text import stop_detail
+from stagectl.supervisor import Outcome
+from stagectl.touch_sweep import (
+    IDENTIFY_HZ,
+    IDENTIFY_SHARE,
+    TOUCH_HZ,
+    TOUCH_S,
+    TOUCH_SHARE,
+    Joint,
+    contact_damping_n_s_per_m,
+    plan,
+)
 from stagectl.trajectory import sweep
 
-_TOUCH_S, _TOUCH_HZ, _TOUCH_SHARE, _SWEEP_SHARE = 6.0, 0.7, 0.6, 0.8
 _WARM_S = 1.0
 _EDGES = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
 _SDS = ("left_sd_m", "right_sd_m", "left_stiffness_sd_n_per_m", "right_stiffness_sd_n_per_m")
@@ -58,7 +69,7 @@ def simulate(
     folder: Path,
     seed: int,
     progress: Progress = lambda what, share: None,
-) -> Stop:
+) -> Outcome:
     """Home, follow `setpoints` (SETPOINT rows that begin at rest) under a law, record; returns how it ended."""
     homed = None
     if machine.micro is not None:
@@ -70,8 +81,8 @@ def simulate(
     if homed is not None:
         _forget_edges(simulation, profile)
     recording = batch.run(simulation, setpoints)
-    stop = Stop(int(recording.commands["stop"][-1]))
-    stop = Stop.FINISHED if stop is Stop.NONE else stop
+    stop, detail = _end_of(simulation, recording, profile, law)
+    ended = Outcome(name, stop or Stop.FINISHED, 0, recording.commands.size, detail=detail)
     manifest = {
         "name": folder.name,
         "profile": profile.effective(),
@@ -82,34 +93,41 @@ def simulate(
         "laws": list(tick.LAWS),
         "seeds": [seed],
     }
-    _record(simulation, recording, manifest, name, law, folder, stop)
+    _record(simulation, recording, manifest, law, folder, ended)
     write_truth(folder, _truth_of(simulation, recording), machine.backlash)
-    return stop
+    return ended
 
 
 def sweep_setpoints(
-    profile: Profile, frequency_hz: float, duration_s: float, share: float = _SWEEP_SHARE
+    profile: Profile, force_share: float, usual_hz: float, duration_s: float, asked_hz: float | None = None
 ) -> np.ndarray:
     """Plan a sweep of the micro over both edges, pressing with a share of the touch force."""
     joint = profile.backlash
     if joint is None:
         raise RequestError(f"profile {profile.name}: this stage has no micro; there is no backlash to identify")
-    press_m = share * joint.touch_force_n / max(joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m)
-    amplitude_m = 0.5 * (joint.left_m + joint.right_m) + press_m
-    return sweep(amplitude_m, frequency_hz, duration_s, dt_s=profile.cycle.period_s).setpoints
+    believed = Joint(
+        joint.left_m,
+        joint.right_m,
+        joint.left_stiffness_n_per_m,
+        joint.right_stiffness_n_per_m,
+        contact_damping_n_s_per_m(profile.effects),
+        joint.touch_force_n,
+    )
+    planned = plan(believed, force_share, usual_hz, duration_s, asked_hz)
+    return sweep(*planned, dt_s=profile.cycle.period_s).setpoints
 
 
 def identify(
     profile: Profile,
     machine: Machine,
-    frequency_hz: float,
+    frequency_hz: float | None,
     duration_s: float,
     folder: Path,
     seed: int,
     progress: Progress = lambda what, share: None,
-) -> Stop:
+) -> Outcome:
     """Home and identify the joint from a sweep over both edges; recorded like `simulate`."""
-    setpoints = sweep_setpoints(profile, frequency_hz, duration_s)
+    setpoints = sweep_setpoints(profile, IDENTIFY_SHARE, IDENTIFY_HZ, duration_s, frequency_hz)
     return simulate(profile, machine, setpoints, SWEEP_NAME, profile.control.law, folder, seed, progress)
 
 
@@ -137,15 +155,16 @@ def _home(profile: Profile, machine: Machine, law: str, seed: int) -> Homed:
     centre_m = float(gap_centre(believed[0]))
     start = Homed(0.0, {})
     simulation = _at_rest(profile, machine, law, seed, 0.0, start)
-    setpoints = sweep_setpoints(profile, _TOUCH_HZ, _TOUCH_S, _TOUCH_SHARE)
+    setpoints = sweep_setpoints(profile, TOUCH_SHARE, TOUCH_HZ, TOUCH_S)
     batch.run(simulation, _hold(setpoints, _WARM_S, profile.cycle.rate_hz))
     recording = batch.run(simulation, setpoints)
     found = simulation.controller.backlash
     known = all(np.isfinite(found[name][0]) for name in ("left_sd_m", "right_sd_m"))
-    if recording.commands["stop"][-1] != 0 or not known:
+    stop, detail = _end_of(simulation, recording, profile, law)
+    if stop is not Stop.NONE or not known:
         raise RequestError(
-            f"machine {machine.name}: touching both edges ended with {Stop(int(recording.commands['stop'][-1])).name} "
-            "and not with both edges known; check backlash in profile and machine"
+            f"machine {machine.name}: touching both edges did not make both known: {stop_sentence(stop, detail)}; "
+            "check backlash in profile and machine"
         )
     width_m = float(found["left_m"][0] + found["right_m"][0])
     identified_centre_m = 0.5 * float(found["right_m"][0] - found["left_m"][0])
@@ -174,10 +193,9 @@ def _record(
     simulation: batch.Simulation,
     recording: batch.Recording,
     manifest: dict[str, Any],
-    name: str,
     law: str,
     folder: Path,
-    stop: Stop,
+    ended: Outcome,
 ) -> None:
     """Write rows, events and manifest; standard deviations are known behind the last row only."""
     rows = new_rows(recording.commands.size)
@@ -198,10 +216,21 @@ def _record(
     recorder = Recorder(folder, manifest, _FIELDS)
     with recorder:
         first_t_ns, last_t_ns = int(rows["t_ns"][0]), int(rows["t_ns"][-1])
-        recorder.event("segment", first_t_ns, number=1, segment=name, law=law, setpoints=int(recording.setpoints.size))
+        count = int(recording.setpoints.size)
+        recorder.event("segment", first_t_ns, number=1, segment=ended.name, law=law, setpoints=count)
         recorder.append(rows)
-        recorder.event("segment_end", last_t_ns, number=1, stop=stop.name)
-        recorder.close({"stop": stop.name, "text": name})
+        recorder.event("segment_end", last_t_ns, number=1, stop=ended.stop.name, detail=ended.detail)
+        recorder.close({"stop": ended.stop.name, "text": STOP_TEXT[ended.stop], "detail": ended.detail})
+
+
+def _end_of(simulation: batch.Simulation, recording: batch.Recording, profile: Profile, law: str) -> tuple[Stop, str]:
+    """Say what stopped it, with the numbers of its last cycle; NONE where nothing did."""
+    stop = Stop(int(recording.commands["stop"][-1]))
+    if stop is Stop.NONE:
+        return stop, ""
+    node_ids = {axis: profile.axis(axis).node_id for axis in profile.axes}
+    measurement, setpoint, command = recording.measurements[-1], recording.setpoints[-1], recording.commands[-1]
+    return stop, stop_detail(stop, measurement, setpoint, command, simulation.controller.guard[0], node_ids, law)
 
 
 def _truth_of(simulation: batch.Simulation, recording: batch.Recording) -> dict[str, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import configparser
 import pickle
+import re
 import threading
 import time
 from dataclasses import replace
@@ -14,10 +15,13 @@ from canopen.sdo.exceptions import SdoAbortedError
 
 from drivers.arming import (
     DriveSettings,
+    StaleTorque,
     configure,
+    detection_time_s,
     heartbeat_producer_ms,
     interpolation_words,
     read_rated_values,
+    torque_cap_n,
 )
 from drivers.can_bus import open_network
 from drivers.canopen_master import Master
@@ -240,7 +244,7 @@ STUCK = [
     ((0x1005, 0), 0x40000080, r"0x1005:00 COB-ID SYNC: wrote 128 .*read .*0x40000080"),
     ((0x1006, 0), 2000, r"0x1006:00 communication cycle period: wrote 1000 .*read 2000"),
     ((0x1014, 0), 0x8000_0081, r"0x1014:00 COB-ID EMCY: wrote 129 .*0x80000081"),
-    ((0x1400, 5), 0, r"0x1400:05 event timer: wrote 10 .*read 0; .*rpdo_deadline_s = 0"),
+    ((0x1400, 5), 0, r"0x1400:05 event timer: wrote 10 .*read 0; .*dead servo stays .*macro.mode = \"position\""),
     ((0x1400, 2), 255, r"0x1400:02 transmission type: wrote 1, read 255"),
     ((0x1800, 2), 254, r"0x1800:02 transmission type: wrote 1, read 254"),
     ((0x1801, 2), 1, r"0x1801:02 transmission type: wrote 255 .*read 1"),
@@ -301,12 +305,15 @@ def test_remote_request_bit_of_the_drive_is_its_own(bench):
 WRONG_NODE = [
     ("vendor", {(0x1018, 1): 0x5254}, r"0x1018:01 vendor id: wanted 0x539, read 0x5254; .*backend"),
     ("product", {(0x1018, 2): 0x10001}, r"0x1018:02 product code: wanted 0x10002, read 0x10001; swap the node ids"),
+    ("revision", {(0x1018, 3): 0x20000}, r"0x1018:03 revision number: wanted 0x10000, read 0x20000; load the firmware"),
+    ("serial", {(0x1018, 4): 0x2A}, r"0x1018:04 serial number: wanted 0x1, read 0x2A; this is another unit"),
+    ("no-serial", {(0x1018, 0): 3}, r"0x1018:04 serial number: wanted 0x1, read nothing; this is another unit"),
     ("device-type", {(0x1000, 0): 0x000F0191}, r"0x1000:00 device type: wanted profile 402, read 401"),
     ("rated-torque", {(0x6076, 0): 59_000}, r"0x6076:00 rated torque: wanted 60000 mN, read 59000 mN"),
     ("rated-current", {(0x6075, 0): 2500}, r"0x6075:00 rated current: wanted 2000 mA, read 2500 mA"),
     ("mode", {(0x6502, 0): 0x80}, r"0x6502:00 supported modes: wanted bit 9 \(torque\), read 0x80"),
     ("enabled", {(0x6041, 0): 0x1637}, r"0x6041:00 shows OPERATION_ENABLED, .*disable it first"),
-    ("stopping", {(0x6041, 0): 0x0217}, r"0x6041:00 shows QUICK_STOP_ACTIVE"),
+    ("stopping", {(0x6041, 0): 0x0217}, r"0x6041:00 shows QUICK_STOP_ACTIVE, .*no encoder tells whether it stands"),
 ]
 
 
@@ -314,7 +321,7 @@ WRONG_NODE = [
 def test_wrong_second_node_refuses_before_anything_is_written(bench, stuck, words):
     bench.micro.stuck.update(stuck)
     with pytest.raises(DriveError, match=f"node 2: {words}"):
-        configure(bench.master, [MACRO, MICRO])
+        configure(bench.master, [MACRO, replace(MICRO, identity=(0x539, 0x10002, 0x10000, 1))])
     assert bench.macro.written == bench.micro.written == []
     assert not any(can_id == 0x000 for can_id, _ in bench.frames)
 
@@ -329,7 +336,7 @@ def test_identity_of_any_product(bench):
     for drive in (bench.macro, bench.micro):
         drive.stuck[0x1018, 1] = 0x5254
         drive.stuck[0x1018, 2] = 7
-    rig = [replace(MACRO, identity=(0x5254, None)), replace(MICRO, identity=(0x5254, None))]
+    rig = [replace(MACRO, identity=(0x5254, None, None, None)), replace(MICRO, identity=(0x5254,))]
     assert [mapping.node_id for mapping in configure(bench.master, rig)] == [1, 2]
 
 
@@ -371,11 +378,144 @@ def test_firmware_older_than_its_eds_refuses(tmp_path):
     bench.close()
 
 
-def test_drive_without_rpdo_deadline_is_accepted_on_request(bench):
+# -- a drive without an RPDO deadline ---------------------------------------------------------------------------------
+
+# 70 and 40 kg, a third of 1 mm. 10 ms of heartbeat and a cycle of 1 ms: t = 11 ms, t^2 = 1.21e-4 s^2.
+# Macro: 2 x 70 kg x 1/3 mm / t^2 = 385.67 N, 771.3 words of 0.5 N. Micro: 70 x 40 / 110 = 25.4545 kg: 140.25 N, 2337.4
+# words of 0.06 N.
+MACRO_STALE = StaleTorque(mass_kg=70.0, way_m=1e-3 / 3.0, needed_n=220.0)
+MICRO_STALE = StaleTorque(mass_kg=70.0 * 40.0 / 110.0, way_m=1e-3 / 3.0, needed_n=80.0)
+CAPPED = [
+    replace(MACRO, heartbeat_ms=10, stale_torque=MACRO_STALE),
+    replace(MICRO, heartbeat_ms=10, stale_torque=MICRO_STALE),
+]
+LACKS = {
+    "refused": lambda drive: drive.refused.update({(0x1400, 5): 0x06090011}),
+    "not kept": lambda drive: drive.stuck.update({(0x1400, 5): 0}),
+}
+
+
+def test_a_drive_without_rpdo_deadline_whose_force_nothing_bounds_is_refused(bench):
     bench.macro.refused[0x1400, 5] = 0x06090011
-    with pytest.raises(DriveError, match=r"0x1400:05 event timer.*capped torque.*Subindex does not exist"):
+    with pytest.raises(DriveError, match=r"0x1400:05 event timer.*read 0; without it the last .*Subindex does not"):
         configure(bench.master, [MACRO])
-    assert configure(bench.master, [replace(MACRO, rpdo_deadline_ms=0)])
+
+
+@pytest.mark.parametrize("lack", LACKS.values(), ids=list(LACKS))
+def test_a_drive_without_rpdo_deadline_gets_less_torque(bench, lack):
+    lack(bench.macro)
+    lack(bench.micro)
+    said = []
+    configure(bench.master, CAPPED, said.append)
+    assert bench.macro.data_store[0x6072][0] == (771).to_bytes(2, "little")
+    assert bench.micro.data_store[0x6072][0] == (2337).to_bytes(2, "little")
+    assert said == [
+        "node 1 has no RPDO deadline (0x1400:05): a dead servo is noticed by its heartbeat after 11 ms, "
+        "so max torque (0x6072) is 385.5 N instead of 2000 N (2 x 70 kg x 0.333 mm / (11 ms)^2)",
+        "node 2 has no RPDO deadline (0x1400:05): a dead servo is noticed by its heartbeat after 11 ms, "
+        "so max torque (0x6072) is 140.2 N instead of 180 N (2 x 25.45 kg x 0.333 mm / (11 ms)^2)",
+    ]
+
+
+def test_a_drive_with_rpdo_deadline_keeps_its_torque_and_nothing_is_said(bench):
+    said = []
+    configure(bench.master, CAPPED, said.append)
+    assert bench.macro.data_store[0x6072][0] == (4000).to_bytes(2, "little")
+    assert said == []
+
+
+def test_the_cap_moves_a_free_mass_by_its_way_in_the_detection_time():
+    cap_n, t_s = torque_cap_n(MICRO_STALE, detection_time_s(CAPPED[1])), 0.011
+    assert 0.5 * cap_n / MICRO_STALE.mass_kg * t_s**2 == pytest.approx(MICRO_STALE.way_m, rel=1e-12)
+
+
+def test_a_cap_that_the_motion_does_not_fit_under_is_refused(bench):
+    """t = 201 ms: 25.4545 kg x 2 / 3 mm / t^2 = 0.42 N; 80 N take sqrt(25.4545 kg x 2 / 3 mm / 80 N) = 14.56 ms."""
+    LACKS["refused"](bench.micro)
+    words = (
+        r"node 2 has no RPDO deadline \(0x1400:05\): .* after 201 ms, so its torque may be 0\.42 N at most "
+        r"\(2 x 25\.45 kg x 0\.333 mm / \(201 ms\)\^2\), and the profile's motion takes 80 N; "
+        r"shorten trip\.heartbeat_s to 0\.013 s, lower macro\.acceleration_limit_m_per_s2 .*Subindex does not exist"
+    )
+    with pytest.raises(DriveError, match=words):
+        configure(bench.master, [MACRO, replace(MICRO, stale_torque=MICRO_STALE)])
+
+
+def test_a_cap_above_the_limit_changes_nothing(bench):
+    LACKS["refused"](bench.micro)
+    said = []
+    configure(bench.master, [replace(CAPPED[1], max_torque_word=500)], said.append)
+    assert bench.micro.data_store[0x6072][0] == (500).to_bytes(2, "little")
+    assert said[0].endswith(
+        "in which 140.2 N do no harm (2 x 25.45 kg x 0.333 mm / (11 ms)^2): its torque stays as it was"
+    )
+
+
+def test_a_drive_that_does_not_keep_the_cap_is_refused(bench):
+    LACKS["refused"](bench.micro)
+    bench.micro.stuck[0x6072, 0] = 3000
+    with pytest.raises(DriveError, match=r"0x6072:00 max torque: wrote 2337 .*read 3000 .*no RPDO deadline"):
+        configure(bench.master, CAPPED)
+
+
+def test_position_mode_needs_no_cap(bench):
+    """The drive's own loop holds the last target: no torque is kept up."""
+    LACKS["refused"](bench.macro)
+    said = []
+    configure(bench.master, [replace(MACRO, mode="position")], said.append)
+    assert bench.macro.data_store[0x6072][0] == (4000).to_bytes(2, "little")
+    assert re.search(r"noticed by its heartbeat after 201 ms, and the drive holds its last target", said[0])
+
+
+# -- a drive that a killed run left in a quick stop -------------------------------------------------------------------
+
+
+def leave_in_quick_stop(drive, positions):
+    """Show QUICK_STOP_ACTIVE until Disable voltage comes, and one encoder reading after the other."""
+    readings = iter(positions)
+
+    def read(index, subindex, od):
+        if index == 0x6041:
+            stopped = (0x6040, 0, bytes(2)) not in drive.written
+            return 0x0217 if stopped else 0x0250
+        return next(readings) if index == 0x6064 else None
+
+    drive.add_read_callback(read)
+
+
+def test_a_standing_drive_in_quick_stop_is_taken_out_of_it(bench):
+    """Disable voltage is controlword 0: 2B = write 2 bytes of 0x6040:00. 1000 counts of 100 nm in 0.1 s are 1 mm/s."""
+    leave_in_quick_stop(bench.macro, [0, 1000])
+    said = []
+    configure(bench.master, [MACRO, MICRO], said.append)
+    sent = [data.hex().upper() for can_id, data in bench.frames if can_id == 0x601]
+    writes = [data for data in sent if data[:2] in ("23", "2B", "2F")]
+    assert writes[0] == "2B40600000000000"
+    assert said == [
+        "node 1 stood in QUICK_STOP_ACTIVE, as a run that was killed leaves it; its power was taken away (0x6040 = 0), "
+        "it shows SWITCH_ON_DISABLED"
+    ]
+
+
+def test_a_drive_that_still_moves_in_quick_stop_is_refused(bench):
+    leave_in_quick_stop(bench.macro, [0, -1001])
+    with pytest.raises(DriveError, match=r"QUICK_STOP_ACTIVE, .*moves at 0\.001001 m/s .* wait until it stands"):
+        configure(bench.master, [MACRO, MICRO])
+    assert bench.macro.written == []
+
+
+def test_a_drive_that_stays_in_quick_stop_is_refused(bench):
+    bench.macro.stuck[0x6041, 0] = 0x0217
+    with pytest.raises(DriveError, match=r"shows QUICK_STOP_ACTIVE 0\.5 s after 0x6040 = 0, wanted SWITCH_ON_DISABLED"):
+        configure(bench.master, [MACRO])
+
+
+def test_nothing_is_released_before_all_drives_were_looked_at(bench):
+    leave_in_quick_stop(bench.macro, [0, 0])
+    bench.micro.stuck[0x6041, 0] = 0x0237
+    with pytest.raises(DriveError, match="node 2: 0x6041:00 shows OPERATION_ENABLED"):
+        configure(bench.master, [MACRO, MICRO])
+    assert bench.macro.written == []
 
 
 def test_unused_pdos_are_switched_off(tmp_path):
@@ -412,6 +552,7 @@ def test_silent_node_is_a_link_error(bench):
         ([replace(MACRO, node_id=0x7E)], "node id 126 is used twice"),
         ([MACRO, replace(MICRO, cycle_us=2000)], r"cycles of \[1000, 2000\] us"),
         ([replace(MACRO, heartbeat_ms=0)], "heartbeat of 0 ms"),
+        ([replace(MACRO, rpdo_deadline_ms=0)], "RPDO deadline 0 ms"),
         ([replace(MACRO, mode="velocity")], "mode = 'velocity' is not one of torque, position"),
         ([replace(MACRO, cycle_us=333)], "cycle of 333 us can't be written to 0x60C2"),
         ([replace(MACRO, eds_path="absent.eds")], "absent.eds: EDS of node 1 can't be read"),

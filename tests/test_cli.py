@@ -1,5 +1,6 @@
 """The command line: what it prints, what its exit codes mean, that one run goes from command to report and replay."""
 
+import html
 import json
 import os
 import re
@@ -21,7 +22,7 @@ from stagectl.errors import DriveError, LinkError, ProfileError, RecordError, Re
 from stagectl.profile import load_profile
 from stagectl.record import read_manifest, read_run
 from stagectl.requests import Phase
-from stagectl.run_page import scores_of
+from stagectl.run_page import page, scores_of
 from stagectl.run_scores import read_truth, score_backlash, segments
 from stagectl.signals import Stop
 from stagectl.supervisor import Supervisor
@@ -128,6 +129,11 @@ def test_wrong_usage_is_2(capsys, arguments):
         (["run", "--trajectory", "trapez"], "did you mean trapezoid"),
         (["run", "--trajectory", "sine", "--stroke-m", "0.1"], "--stroke-m belongs to trapezoid"),
         (["run", "--trajectory", "move"], "needs --target-m"),
+        (["run", "--trajectory", "move", "--target-m", "0.5"], "--target-m is 0.5, the travel of oled-printer is"),
+        (["run", "--trajectory", "move", "--target-m", "nan"], "--target-m is nan"),
+        (["run", "--velocity-m-per-s", "-0.1", "--backend", "plant"], "velocity_m_per_s is -0.1"),
+        (["run", "--stroke-m", "nan", "--backend", "plant"], "stroke_m is nan"),
+        (["run", "--trajectory", "sine", "--frequency-hz", "-1", "--backend", "plant"], "--frequency-hz is -1"),
         (["run", "--trajectory", "absent.csv", "--backend", "plant"], "absent.csv"),
         (["home", "--backend", "plant"], "take --backend rig"),
         (["identify", "--profile", "single-axis", "--backend", "plant"], "no backlash to identify"),
@@ -376,16 +382,40 @@ def test_a_motion_that_the_guard_ended_is_said_and_repeated_once(clean, tmp_path
     assert ends == [Stop.SENSOR_AGE, Stop.FINISHED]
     scores = scores_of(run, None)
     assert len(scores.motions) == 1  # the repetition
-    assert len(scores.ended_early) == 1
+    (early,) = scores.ended_early
+    assert early == driven.trips[0].text
+    assert re.search(r"newest sample \d+ is \d+\.\d ms old, limit \d+ ms; check beams", early)
 
 
-def test_what_fails_twice_ends_the_demo(clean, tmp_path):
+def test_what_fails_twice_ends_the_demo_and_is_read_back_with_its_numbers(capsys, clean, tmp_path):
     at_s = seconds_into(clean[2], "trapezoid under dsmc")
     fault = Fault("sensor_silence", at_s=at_s)  # for good
     driven, said, run = driven_with((fault,), tmp_path / "run")
     assert driven.stop is not Stop.FINISHED
     assert len(said) == 1
     assert read_manifest(run.folder)["record"]["state"] == "closed"
+    numbers = driven.outcomes[-1].text
+    assert re.search(r"no valid sample came within \d s; check beams", numbers)
+    for command in (["runs", "list", "--runs", tmp_path], ["runs", "show", run.folder]):
+        assert numbers in " ".join(call(capsys, *command)[1].split())
+    assert driven.trips[0].text in call(capsys, "runs", "show", run.folder)[1]
+    assert call_json(capsys, "runs", "list", "--runs", tmp_path)[1]["runs"][0]["text"] == numbers
+    text = page(run, scores_of(run, None), "").html()
+    assert html.escape(driven.trips[0].text) in text
+    assert html.escape(numbers) in text
+
+
+def test_a_stop_between_two_motions_is_the_end_of_the_second(tmp_path):
+    profile = load_profile("single-axis")
+    with Supervisor(profile, BatchBackend(load_machine("single-axis"), seed=1), tmp_path / "run") as stage:
+        assert stage.home().finished
+        assert stage.armed().finished
+        low_m, high_m = stage.profile.macro.travel_m
+        stage._distress(Stop.LEASE, "for a test")
+        stage.pump(1.0)
+        ended = stage.move(0.5 * (low_m + high_m) + 0.01)
+    assert (ended.stop, ended.rows) == (Stop.LEASE, 0)
+    assert ended.text == "the lease on motion ran out: for a test"
 
 
 # ---- the value seam, and a table from elsewhere ---------------------------------------------------------------------
@@ -407,6 +437,23 @@ def test_the_value_seam_follows_and_is_recorded(capsys, tmp_path):
     code, plotted, _ = call_json(capsys, "runs", "plot", answer["run"])
     assert code == 0
     assert Path(plotted["files"][0]).read_text(encoding="utf-8").count("<svg") == 2
+
+
+def test_a_stop_behind_the_value_seam_is_said_with_its_numbers(capsys, tmp_path):
+    source = Path(load_profile("oled-printer").source_path)
+    hot = source.read_text(encoding="utf-8")
+    for line, tight in (("thermal_force_n = 700.0", 30.0), ("thermal_time_constant_s = 60.0", 0.5)):
+        assert hot.count(line) == 1
+        hot = hot.replace(line, f"{line.partition(' = ')[0]} = {tight}")
+    (tmp_path / source.name).write_text(hot)
+    for eds in source.parent.glob("*.eds"):
+        (tmp_path / eds.name).write_bytes(eds.read_bytes())
+    arguments = ["run", "--stroke-m", "0.1", "--profile", tmp_path / source.name, "--backend", "plant"]
+    code, answer, _ = call_json(capsys, *arguments, "--runs", tmp_path / "runs")
+    assert (code, answer["stop"]) == (1, "THERMAL")
+    assert re.search(r"macro at 30\.\d N rms, limit 30 N; let it cool", answer["text"])
+    assert answer["ended_early"] == [answer["text"]]
+    assert answer["text"].endswith(call_json(capsys, "runs", "show", answer["run"])[1]["text"])
 
 
 def test_the_value_seam_identifies(capsys, tmp_path):
@@ -469,6 +516,10 @@ def test_profiles_are_listed_checked_and_shown(capsys):
     code, answer, _ = call_json(capsys, "profile", "check", "oled-printer")
     assert code == 0
     assert re.fullmatch("[0-9a-f]{64}", answer["sha256"])
+    assert answer["limp_deceleration_m_per_s2"] == pytest.approx(0.097, abs=1e-3)
+    assert "brakes at 2 m/s^2, and a limp micro keeps off its stops up to 0.097 m/s^2" in " ".join(
+        call(capsys, "profile", "check", "oled-printer")[1].split()
+    )
     code, answer, _ = call_json(capsys, "profile", "show", "oled-printer")
     assert code == 0
     assert answer["profile"]["control"]["pid_bandwidth_hz"] == 50.0  # a default, filled in
@@ -538,6 +589,43 @@ def test_nothing_interrupts_the_way_to_rest(capsys):
         deliver("test", True, work)
     assert end.value.exit_code == 0
     assert json.loads(capsys.readouterr().out)["stopped"]
+
+
+def test_runs_that_can_not_be_are_refused_before_anything_opens(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    for runs in (tmp_path / "file", tmp_path / "file" / "below"):
+        code, answer, _ = call_json(capsys, "home", "--backend", "batch", "--runs", runs)
+        assert (code, answer["error"]["kind"]) == (2, "RequestError")
+        assert f"{tmp_path / 'file'} is a file" in answer["error"]["message"]
+    code, answer, _ = call_json(capsys, "runs", "show", tmp_path / "file")
+    assert code == 2
+    assert f"give the run's folder, that is {tmp_path}" in answer["error"]["message"]
+
+
+def test_a_run_that_this_version_can_not_judge_is_5(capsys, demo_run, tmp_path):
+    source = Path(demo_run[0]["run"])
+    for name in ("later", "empty"):
+        (tmp_path / name).mkdir()
+        for file in ("manifest.json", "events.jsonl", "snapshot.npz", "samples.arrow"):
+            (tmp_path / name / file).write_bytes((source / file).read_bytes())
+    events = tmp_path / "later" / "events.jsonl"
+    events.write_text(events.read_text().replace('"stop": "FINISHED"', '"stop": "LATER"'))
+    code, answer, _ = call_json(capsys, "runs", "show", tmp_path / "later")
+    assert code == 5
+    assert "'LATER'" in answer["error"]["message"]
+    (tmp_path / "empty" / "samples.arrow").write_bytes(b"")
+    code, answer, _ = call_json(capsys, "replay", tmp_path / "empty")
+    assert code == 5
+    assert "nothing to replay" in answer["error"]["message"]
+    (tmp_path / "later" / "snapshot.npz").unlink()
+    assert call_json(capsys, "replay", tmp_path / "later")[0] == 5
+
+
+def test_wrong_places_and_columns_are_refused_before_any_work(capsys, demo_run, tmp_path):
+    code, _, err = call_json(capsys, "runs", "plot", demo_run[0]["run"], "--out", tmp_path / "x.pdf")
+    assert code == 2
+    assert "scoring" not in err
+    assert call_json(capsys, "runs", "export", demo_run[0]["run"], "--columns", "")[0] == 2
 
 
 @pytest.mark.parametrize("distance", ["nan", "inf", "5"])

@@ -8,6 +8,7 @@ import pytest
 from sim_backend.drive_states import STATUSWORD, DriveState, next_state
 from sim_backend.machine import Start, load_machine
 from sim_backend.rig import Rig
+from tests.stage import with_values
 
 MS = 1_000_000
 S = DriveState
@@ -66,8 +67,10 @@ def test_statuswords_of_the_states():
 class Bench:
     """A master made of frames: every byte is written here, none by our drivers."""
 
-    def __init__(self, **start) -> None:
+    def __init__(self, lacks_deadline: bool = False, **start) -> None:
         machine = load_machine("oled-printer")
+        if lacks_deadline:
+            machine = with_values(machine, macro__has_rpdo_deadline=False, micro__has_rpdo_deadline=False)
         if start:
             machine = machine.model_copy(update={"start": Start(**start)})
         self.rig = Rig(machine, seed=1)
@@ -455,6 +458,38 @@ def test_abort_connection_options(option, state):
     bench.enable()
     bench.wait(200)
     assert bench.rig.drive(1).state == state
+
+
+@pytest.mark.parametrize("node_id", [1, 2])
+def test_a_drive_may_lack_the_rpdo_deadline(node_id):
+    """Sub-index 5 is aborted with 0609 0011h (no such sub-index), and the highest is 3."""
+    bench = Bench(lacks_deadline=True)
+    assert bench.sdo(node_id, "2b 00 14 05 0a 00 00 00") == "80 00 14 05 11 00 09 06"
+    assert bench.sdo(node_id, "40 00 14 05 00 00 00 00") == "80 00 14 05 11 00 09 06"
+    assert bench.read(node_id, 0x1400, 0) == 3
+
+
+def test_under_the_cap_a_stale_torque_moves_the_micro_less_than_a_third_of_its_way():
+    """2337 words (140.2 N of 60 N x 300 %) on 70 and 40 kg, a heartbeat of 10 ms; see `drivers.arming.StaleTorque`."""
+    bench = Bench(lacks_deadline=True)
+    bench.arm(node_id=2, stop=2)
+    bench.write(2, 0x6072, 0, 2337, 2)
+    bench.write(2, 0x1016, 1, 0x7E << 16 | 10, 4)
+    bench.enable(node_id=2)
+    state = bench.rig.plant_state()
+    before_m = state["end_position_m"] - state["macro_position_m"]
+    bench.cycle(struct.pack("<Hh", 0x0F, 3000), node_id=2)  # more than it may give
+    bench.send(0x77E, "05")  # the last of the servo
+    waited_ms = 0.0
+    while bench.rig.drive(2).state == S.OPERATION_ENABLED:
+        bench.wait(0.25)
+        waited_ms += 0.25
+        assert waited_ms <= 11.0
+    assert waited_ms == 10.0
+    assert (0x082, bytes.fromhex("3081110000000000")) in bench.heard
+    state = bench.rig.plant_state()
+    moved_m = abs(state["end_position_m"] - state["macro_position_m"] - before_m)
+    assert 0.2e-3 < moved_m < 1e-3 / 3.0
 
 
 def test_leaving_operational_counts_as_a_lost_connection(bench):

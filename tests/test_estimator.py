@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 
 from stagectl import batch, estimator, trajectory
-from stagectl.signals import SETPOINT
+from stagectl.signals import MEASUREMENT, SETPOINT
 from tests.stage import believed, centre_m, simulated, with_values
 from tests.stage_loop import Loop
 
@@ -187,3 +187,13 @@ def test_the_first_sample_places_the_belief(oled_profile, oled_machine):
     assert model["macro_position_m"] == pytest.approx(0.123 + 75.3e-6, abs=2e-6)
     assert abs(command["macro_force_asked_n"]) < 50.0
     assert 0.0 < abs(command["micro_force_asked_n"]) < 5.0
+
+
+def test_a_fresh_start_remembers_nothing(oled_profile):
+    """What effects remembered belongs to the motion before."""
+    model, e, m = estimator.init_model(), estimator.init(oled_profile), np.zeros(1, MEASUREMENT)
+    model["memory"] = 0.7
+    m["end_position_m"] = 0.1
+    estimator.start(e[0], model[0], m[0])
+    assert model["end_position_m"][0] == 0.1
+    assert not np.any(model["memory"])

@@ -14,6 +14,7 @@ from drivers.wire import Inbox
 from sim_backend.faults import Fault
 from stagectl.backend import BatchBackend
 from stagectl.errors import DriveError, LinkError, RecordError, RequestError
+from stagectl.profile import Identity
 from stagectl.record import read_run
 from stagectl.replay import replay
 from stagectl.requests import Phase
@@ -22,7 +23,7 @@ from stagectl.signals import SETPOINT, STOP_TEXT, Stop
 from stagectl.supervisor import BacklashEstimate, Supervisor
 from tests.small_disk import small_disk
 from tests.stage import with_values
-from tests.struck_stage import REST_M_PER_S, SEED, Stage, Strike, inject, struck
+from tests.struck_stage import REST_M_PER_S, SEED, Stage, Strike, home_by_truth, inject, struck
 
 MACRO, MICRO = 1, 2  # node ids
 MACRO_TPDO, MICRO_TPDO, MICRO_RPDO, SYNC = 0x181, 0x182, 0x202, 0x080
@@ -179,7 +180,7 @@ CASES = {
     "limit switch": Case(
         inject(Fault("input", node_id=MACRO, bits=POSITIVE_LIMIT)),
         Stop.DIGITAL_INPUT,
-        r"macro \(node 1\): positive limit switch \(0x60FD = 0x2\)",
+        r"macro \(node 1\): positive limit switch \(0x60FD = 0x2\); .* the macro off .* by hand in negative direction",
         guided=True,
     ),
     "pressure": Case(
@@ -411,6 +412,21 @@ def test_a_drive_in_fault_is_reset_by_an_acknowledgement_and_by_nothing_else(tmp
     assert replay(tmp_path / "run").exact
 
 
+@pytest.mark.parametrize(("bits", "away"), [(0x1, "in positive direction"), (0x3, "clear the cause")])
+def test_a_pressed_limit_switch_refuses_power(bits, away, tmp_path, oled_profile, oled_machine):
+    """Whoever powers the stage there does so without knowing which way is free: the switch is left by hand."""
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        inject(Fault("input", node_id=MACRO, bits=bits, duration_s=0.2))(one.stage, one.backend)
+        one.stage.pump(0.05)
+        assert one.stage.enable() is Stop.DIGITAL_INPUT
+        assert re.search(rf"macro \(node 1\): negative limit switch.*{away}", one.stage.detail)
+        assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+        one.stage.pump(0.3)
+        assert one.stage.acknowledge() is Stop.NONE
+        assert one.stage.enable() is Stop.NONE
+
+
 def test_an_open_interlock_refuses_power(tmp_path, oled_profile, oled_machine):
     one = Stage(tmp_path / "run", oled_profile, oled_machine)
     with one:
@@ -493,6 +509,157 @@ def arm(profile, backend, folder) -> None:
     """Configure the drives and let go again."""
     with Supervisor(profile, backend, folder):
         pass
+
+
+def as_hardware(machine) -> BatchBackend:
+    """The rig behind a backend that demands the profile's own identity of every node, as hardware does."""
+    backend = BatchBackend(machine, seed=SEED)
+    backend.vendor_id = None
+    return backend
+
+
+def with_identity(profile, **numbers):
+    """Copy a profile that names the rig's drives as its own; `numbers` are of the micro's drive."""
+    rig = {"vendor_id": 0x5254}
+    macro = Identity(**rig, product_code=0x10001)
+    return with_values(
+        profile, macro__identity=macro, micro__identity=Identity(**{**rig, "product_code": 0x10002, **numbers})
+    )
+
+
+def test_every_identity_number_of_the_profile_is_compared(tmp_path, oled_profile, oled_machine):
+    profile = with_identity(oled_profile, revision_number=0x10000, serial_number=1)
+    arm(profile, as_hardware(oled_machine), tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("number", "pattern"),
+    [
+        ("product_code", r"node 2: 0x1018:02 product code: wanted 0x7, read 0x10002; swap the node ids"),
+        ("revision_number", r"node 2: 0x1018:03 revision number: wanted 0x7, read 0x10000; load the firmware"),
+        ("serial_number", r"node 2: 0x1018:04 serial number: wanted 0x7, read 0x1; this is another unit"),
+    ],
+)
+def test_another_unit_than_the_profile_names_is_not_armed(number, pattern, tmp_path, oled_profile, oled_machine):
+    with pytest.raises(DriveError, match=pattern):
+        arm(with_identity(oled_profile, **{number: 7}), as_hardware(oled_machine), tmp_path / "run")
+
+
+def test_the_rig_plays_whatever_unit_a_profile_names(tmp_path, oled_profile, oled_machine):
+    arm(
+        with_identity(oled_profile, vendor_id=0x539, serial_number=7),
+        BatchBackend(oled_machine, seed=SEED),
+        tmp_path / "run",
+    )
+
+
+GENTLE = {"trip__heartbeat_s": 0.01, "macro__acceleration_limit_m_per_s2": 2.0}
+"""What drives without an RPDO deadline leave of oled-printer: the voice coil needs 80 N of the 140 N of their cap."""
+
+
+def without_deadline(machine):
+    """Copy a machine whose drives lack 0x1400:05."""
+    return with_values(machine, macro__has_rpdo_deadline=False, micro__has_rpdo_deadline=False)
+
+
+def test_drives_without_rpdo_deadline_are_armed_with_less_torque(tmp_path, oled_profile, oled_machine):
+    """385.5 N and 140.2 N instead of 2000 N and 180 N: drives, laws and guard go by them, and so does the replay."""
+    one = Stage(tmp_path / "run", with_values(oled_profile, **GENTLE), without_deadline(oled_machine))
+    with one:
+        assert [node.objects[0x6072 << 8] for node in one.backend.rig.nodes] == [771, 2337]
+        said = list(one.stage.remarks)
+        tracker = one.backend.servo.tracker
+        for axis, law_limit, limit_n in (
+            ("macro", "macro_force_limit_n", 385.5),
+            ("micro", "precision_force_limit_n", 140.22),
+        ):
+            assert getattr(one.stage.profile, axis).force_limit_n == pytest.approx(limit_n)
+            assert tracker.active.guard[f"{axis}_force_limit_n"][0] == pytest.approx(limit_n)
+            assert tracker.active.law[law_limit][0] == pytest.approx(limit_n)
+        assert one.arm() is Stop.NONE
+        assert one.move().finished
+    assert len(said) == 2
+    assert all("no RPDO deadline (0x1400:05): a dead servo is noticed by its heartbeat after 11 ms" in t for t in said)
+    run = read_run(tmp_path / "run")
+    assert [event["text"] for event in run.events if event["event"] == "remark"] == said
+    assert np.abs(run.rows["micro_word"]).max() <= 2337
+    assert replay(tmp_path / "run").exact
+
+
+def test_a_law_does_not_ask_beyond_the_cap(tmp_path, oled_profile, oled_machine):
+    """A millisecond of an absurd error drives the law to its limit: what it asks ends at the cap, not at 180 N."""
+
+    def strike(stage, backend):
+        backend.servo.tracker.active.law["error_integral_m_s"] = 1.0
+
+    machine = without_deadline(oled_machine)
+    seen = struck(tmp_path / "run", with_values(oled_profile, **GENTLE), machine, strike)
+    asked_n = np.abs(seen.run.rows["micro_force_asked_n"]).max()
+    assert asked_n == pytest.approx(140.22)
+    assert np.abs(seen.run.rows["micro_word"]).max() == 2337
+
+
+def test_a_profile_whose_motion_the_cap_forbids_is_not_armed(tmp_path, oled_profile, oled_machine):
+    pattern = (
+        r"node 1 has no RPDO deadline .* after 201 ms, so its torque may be 1\.16 N at most .* takes 440 N; "
+        r"shorten trip\.heartbeat_s to 0\.009 s"
+    )
+    with pytest.raises(DriveError, match=pattern):
+        arm(oled_profile, BatchBackend(without_deadline(oled_machine), seed=SEED), tmp_path / "run")
+
+
+def killed_at_speed(folder, profile, machine, wait_s: float) -> Stage:
+    """Move, then let nobody of ours live: no cycle, no SDO; `wait_s` pass on the rig."""
+
+    class Killed(Exception):
+        pass
+
+    def strike(stage, backend):
+        raise Killed
+
+    one = Stage(folder, profile, machine)
+    one.__enter__()
+    assert one.arm() is Stop.NONE
+    with pytest.raises(Killed):
+        one.move(strike)
+    one.stage.recorder.abandon()
+    one.backend.wire.advance_to(one.backend.wire.t_ns + round(wait_s * 1e9))
+    return one
+
+
+def test_a_stage_whose_processes_were_killed_is_armed_again(tmp_path, oled_profile, oled_machine):
+    """The macro's drive stands in QUICK_STOP_ACTIVE for good; arming takes it out of that, and says so."""
+    left = killed_at_speed(tmp_path / "killed", oled_profile, oled_machine, 1.0)
+    assert left.drive_states == ("QUICK_STOP_ACTIVE", "SWITCH_ON_DISABLED")
+    backend = BatchBackend(oled_machine, seed=SEED, rig=left.backend.rig)
+    with Supervisor(oled_profile, backend, tmp_path / "run") as stage:
+        assert left.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+        assert stage.remarks == [
+            "node 1 stood in QUICK_STOP_ACTIVE, as a run that was killed leaves it; its power was taken away "
+            "(0x6040 = 0), it shows SWITCH_ON_DISABLED"
+        ]
+        home_by_truth(stage, left.plant)
+        assert stage.enable() is Stop.NONE
+    assert replay(tmp_path / "run").exact
+
+
+def test_a_stage_that_is_still_braking_is_not_let_go(tmp_path, oled_profile, oled_machine):
+    """0.05 s after the kill, 0.02 s of them undetected: from 0.2 m/s at 2 m/s^2 some 0.1 m/s are left."""
+    left = killed_at_speed(tmp_path / "killed", oled_profile, oled_machine, 0.05)
+    backend = BatchBackend(oled_machine, seed=SEED, rig=left.backend.rig)
+    with pytest.raises(DriveError, match=r"node 1: .* shows QUICK_STOP_ACTIVE, .* moves at 0\.0\d+ m/s by its encoder"):
+        arm(oled_profile, backend, tmp_path / "run")
+    assert left.drive_states[0] == "QUICK_STOP_ACTIVE"
+
+
+def test_a_fault_of_a_former_run_stays_until_it_is_acknowledged(tmp_path, oled_profile, oled_machine):
+    backend = BatchBackend(oled_machine, seed=SEED, faults=(Fault("emergency", node_id=MACRO, code=ENCODER_FAULT),))
+    backend.wire.advance_to(backend.wire.t_ns + 100_000_000)
+    with Supervisor(oled_profile, backend, tmp_path / "run") as stage:
+        assert stage.enable() is not Stop.NONE
+        assert backend.rig.nodes[0].drive.state.name == "FAULT"
+        assert stage.acknowledge() is Stop.NONE
+        assert backend.rig.nodes[0].drive.state.name == "SWITCH_ON_DISABLED"
 
 
 def test_drives_of_another_world_are_not_armed(tmp_path, oled_profile, oled_machine):

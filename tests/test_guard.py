@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from stagectl import guard
-from stagectl.signals import MEASUREMENT, SETPOINT, STOP_TEXT, Stop
+from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT, STOP_TEXT, Stop
+from stagectl.stop_text import stop_detail
 from tests.stage import with_values
 
 MS = 1_000_000
@@ -72,6 +73,9 @@ LIMITS = [
     ({"macro_position_m": -0.9499e-3}, {"macro_position_m": -0.9501e-3}, Stop.MICRO_STROKE),
     ({"macro_position_m": 0.9499e-3}, {"macro_position_m": 0.9501e-3}, Stop.MICRO_STROKE),
     ({"t_ns": 10**12 + 20 * MS}, {"t_ns": 10**12 + 20 * MS + 1}, Stop.SENSOR_AGE),
+    # this cycle is half a period old: a sample may lie one period ahead of it
+    ({"sample_t_ns": 10**12 + 3 * MS // 2}, {"sample_t_ns": 10**12 + 3 * MS // 2 + 1}, Stop.SAMPLE_AHEAD),
+    ({"t_ns": 10**12 - MS}, {"t_ns": 10**12 - MS - 1}, Stop.SAMPLE_AHEAD),
     ({"overrun_ns": 20 * MS}, {"overrun_ns": 20 * MS + 1}, Stop.OVERRUN),
     ({"lease_left_ns": 1}, {"lease_left_ns": 0}, Stop.LEASE),
     ({"lease_left_ns": 1}, {"lease_left_ns": -MS}, Stop.LEASE),
@@ -107,6 +111,20 @@ LIMITS = [
 def test_each_limit_from_both_sides(oled_profile, good, bad, code):
     assert Cycle(oled_profile).set(**good).stop() is Stop.NONE
     assert Cycle(oled_profile).set(**bad).stop() is code
+
+
+def test_a_sample_of_the_future_says_how_far_and_what_to_check(oled_profile):
+    one = Cycle(oled_profile).set(sample_t_ns=10**12 + 4 * MS)
+    assert one.stop() is Stop.SAMPLE_AHEAD
+    nothing = np.zeros(1, COMMAND)
+    said = stop_detail(Stop.SAMPLE_AHEAD, one.measurement[0], one.setpoint[0], nothing[0], one.guard[0], {}, "dsmc")
+    assert "newest sample 1000 is 3.500 ms ahead of its cycle, limit 1 ms; check interferometer.rate_hz" in said
+
+
+def test_how_far_ahead_a_sample_may_lie_is_the_profiles_period(oled_profile):
+    slow = with_values(oled_profile, cycle__rate_hz=500.0)
+    assert Cycle(slow).set(sample_t_ns=10**12 + 5 * MS // 2).stop() is Stop.NONE
+    assert Cycle(slow).set(sample_t_ns=10**12 + 5 * MS // 2 + 1).stop() is Stop.SAMPLE_AHEAD
 
 
 @pytest.mark.parametrize("edge_m", [-0.45, 0.45])
@@ -323,6 +341,7 @@ BRAKING = [  # what the drive that brakes the macro makes meaningless, and what 
     ({"end_position_m": 1e-3}, Stop.MICRO_STROKE, True),
     ({"reference_lost": 1}, Stop.REFERENCE_LOST, True),
     ({"sample_t_ns": 0}, Stop.SENSOR_AGE, True),
+    ({"sample_t_ns": 10**13}, Stop.SAMPLE_AHEAD, True),
     ({"macro_n": math.nan}, Stop.COMMAND_NOT_FINITE, True),
     ({"micro_n": math.nan}, Stop.COMMAND_NOT_FINITE, True),
     ({"end_position_m": math.nan}, Stop.MEASUREMENT_NOT_FINITE, True),
@@ -394,6 +413,7 @@ WAYS = {
     Stop.FOLLOWING_ERROR: lambda one: one.set(end_position_m=3e-4).stop(),
     Stop.MICRO_STROKE: lambda one: one.set(macro_position_m=2e-3).stop(),
     Stop.SENSOR_AGE: lambda one: one.set(sample_t_ns=0).stop(),
+    Stop.SAMPLE_AHEAD: lambda one: one.set(sample_t_ns=10**13).stop(),
     Stop.REFERENCE_LOST: lambda one: one.set(reference_lost=1).stop(),
     Stop.OVERRUN: lambda one: one.set(overrun_ns=10**9).stop(),
     Stop.THERMAL: after_many(5000, micro_n=180.0),

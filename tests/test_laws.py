@@ -88,7 +88,7 @@ class Micro:
         self.ahead["macro_position_m"] = reference.gap_centre(self.q[0])
         return dsmc.precision(
             self.law[0], self.ahead[0], self.after[0], self.seen[0], self.later[0], self.later[0],
-            self.mass_kg, self.known_n, self.disturbance_n, self.q[0], self.dt_s,
+            self.mass_kg, self.known_n, self.disturbance_n, -180.0, 180.0, self.q[0], self.dt_s,
         )  # fmt: skip
 
     def __getitem__(self, name: str) -> float:

@@ -137,6 +137,28 @@ def test_position_mode_is_the_default_and_needs_a_longer_rpdo(bench):
     assert profile.worst_bus_load_ratio == pytest.approx(0.555)  # RPDO of 8 bytes: 135 bit for 95
 
 
+def test_what_the_motion_asks_of_each_drive():
+    """oled-printer: 110 kg and 40 kg at 4 m/s^2, which is more than the ramp's 2 m/s^2."""
+    profile = load_profile("oled-printer")
+    assert profile.motion_force_n("macro") == 440.0
+    assert profile.motion_force_n("micro") == 160.0
+
+
+def test_a_lower_force_limit_takes_the_thermal_limit_along_and_loads_again():
+    profile = load_profile("oled-printer")
+    lowered = profile.with_force_limits({"micro": 50.0, "macro": 3000.0})
+    assert (lowered.micro.force_limit_n, lowered.micro.thermal_force_n) == (50.0, 50.0)
+    assert (lowered.macro, lowered.sha256) == (profile.macro, profile.sha256)
+    assert profile_from_effective(lowered.effective(), "the test").effective() == lowered.effective()
+
+
+def test_a_limp_micro_keeps_off_its_stops_up_to_a_braking_worked_out_by_hand():
+    """oled-printer towards its right edge: from 75.3 um beyond the spring's rest 924.7 um to the stop, 824 um of them
+    against 9870 N/m: (9870 x 824e-6^2 + 500 x (1e-6 - 75.3e-6^2)) / (2 x 40 x 924.7e-6) = 0.0973; left: 0.1515."""
+    assert load_profile("oled-printer").limp_deceleration_m_per_s2 == pytest.approx(0.0973, abs=1e-4)
+    assert load_profile("single-axis").limp_deceleration_m_per_s2 is None
+
+
 def test_profile_is_frozen():
     profile = load_profile("oled-printer")
     with pytest.raises(ValidationError):

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from bench import replaying
+from drivers.air import ciddor_index
+from sim_backend.air import index_of
+from sim_backend.machine import load_machine
+from stagectl.backend import BatchBackend
 from stagectl.errors import RecordError
+from stagectl.profile import load_profile
 from stagectl.record import Recorder, Run, read_run
 from stagectl.replay import replay, replay_run
 from stagectl.row import new_rows
+from stagectl.supervisor import Supervisor
 from stagectl.tracker import LAW_NAMES
 from tests.effect_numbers import everything_that_remembers
 from tests.stage import with_values
@@ -105,3 +111,24 @@ def test_a_run_read_twice_replays_alike(recorded):
     again = read_run(recorded.folder)
     assert replay_run(again) == replay_run(recorded)
     assert replay_run(again).exact
+
+
+def test_the_index_of_air_that_a_device_tells_is_in_the_rows_and_replays(tmp_path):
+    """The machine's air is 2 K and 10 hPa away from the profile's; the uMD2 tells it."""
+    machine = load_machine("oled-printer-umd2")
+    warm = machine.model_copy(
+        update={"air": machine.air.model_copy(update={"temperature_degc": 22.0, "pressure_pa": 100325.0})}
+    )
+    with Supervisor(load_profile("oled-printer-umd2"), BatchBackend(warm, seed=4), tmp_path / "warm") as stage:
+        assert stage.home().finished
+        stage.enable()
+        assert stage.move(0.02).finished
+        used_now = float(stage.status()["air_index_ratio"])
+        assert stage._scales() == pytest.approx((632.991e-9 / (8.0 * used_now),) * 2, rel=1e-15)
+    run = read_run(tmp_path / "warm")
+    used = run.rows["air_index_ratio"]
+    believed = ciddor_index(632.991e-9, 20.0, 101_325.0, 50.0, 450.0)
+    assert used[0] == believed
+    assert abs(used[-1] - index_of(warm.air)) < 2e-8 < 4e-6 < abs(used[-1] - believed)
+    found = replay_run(run)
+    assert found.exact, found.first_difference

@@ -8,9 +8,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from stagectl import report
+from stagectl import figures, report
 from stagectl.errors import RecordError, RequestError
-from stagectl.report import BacklashCurve, ErrorTrace, Estimate, Figure, HoldTrace, Quantity, Report, Table, TimeSeries
+from stagectl.figures import BacklashCurve, ErrorTrace, Estimate, HoldTrace, TimeSeries
+from stagectl.report import Figure, Quantity, Report, Table
 
 _RNG = np.random.default_rng(5)
 _T_S = np.arange(6000) * 1e-3
@@ -21,18 +22,18 @@ def _tracking(image_format="svg", label="PID"):
     peak_m = _NOISE_M.copy()
     peak_m[3000] = 900e-9
     traces = [ErrorTrace(label, _T_S, peak_m, peak_m + _NOISE_M), ErrorTrace("DSMC", _T_S, _NOISE_M)]
-    return report.tracking_figure(_T_S, 0.4 * np.sin(_T_S), traces, image_format)
+    return figures.tracking_figure(_T_S, 0.4 * np.sin(_T_S), traces, image_format)
 
 
 def _hold(image_format="svg"):
-    return report.hold_figure([HoldTrace("PID", 2 * _NOISE_M, 1e-3), HoldTrace("DSMC", _NOISE_M, 1e-3)], image_format)
+    return figures.hold_figure([HoldTrace("PID", 2 * _NOISE_M, 1e-3), HoldTrace("DSMC", _NOISE_M, 1e-3)], image_format)
 
 
 def _backlash(image_format="svg"):
     x_m = 70e-6 + 260e-6 * np.sin(_T_S * 6.0)
     force_n = np.where(x_m > 176e-6, 9.87e3 * (x_m - 176e-6), np.where(x_m < -25.4e-6, 13.2e3 * (x_m + 25.4e-6), 0.0))
     identified = BacklashCurve(25.6e-6, 175.9e-6, 13.1e3, 9.9e3, 0.2e-6, 0.1e-6)
-    return report.backlash_figure(
+    return figures.backlash_figure(
         x_m, force_n, identified, BacklashCurve(25.4e-6, 176e-6, 13.2e3, 9.87e3), image_format
     )
 
@@ -42,13 +43,13 @@ def _convergence(image_format="svg"):
     estimates = [
         Estimate(name, "µm", _T_S, 25.4 + 0.3 * half, half, 25.4) for name in ("left edge", "right edge", "width")
     ]
-    return report.convergence_figure(estimates, image_format)
+    return figures.convergence_figure(estimates, image_format)
 
 
 def _timing(image_format="svg"):
     late_ns = (26e3 * np.exp(0.3 * _RNG.standard_normal(6000))).astype(np.int64)
     late_ns[0] = 0
-    return report.timing_figure([TimeSeries("wake-up", late_ns)], 1_000_000, image_format)
+    return figures.timing_figure([TimeSeries("wake-up", late_ns)], 1_000_000, image_format)
 
 
 _DRAW = {
@@ -93,8 +94,8 @@ def test_an_unknown_image_format_is_refused():
 def test_thinning_keeps_every_peak():
     values = _RNG.standard_normal(100_003)
     values[54_321], values[77_777] = 50.0, -60.0
-    t, thin = report._envelope(np.arange(100_003) * 1e-3, values)
-    assert thin.size < 3 * report._LINE_BINS_COUNT
+    t, thin = figures._envelope(np.arange(100_003) * 1e-3, values)
+    assert thin.size < 3 * figures._LINE_BINS_COUNT
     assert (thin.max(), thin.min()) == (50.0, -60.0)
     assert t[np.argmax(thin)] == pytest.approx(54.321)
     assert (t[0], t[-1]) == (0.0, pytest.approx(100.002))

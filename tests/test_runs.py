@@ -12,7 +12,7 @@ from scipy.io import loadmat, savemat
 from stagectl.errors import RecordError, RequestError
 from stagectl.record import Recorder, read_run
 from stagectl.row import ROW, new_rows
-from stagectl.runs import export, import_table, list_runs, new_run_folder, show
+from stagectl.runs import ending, export, import_table, list_runs, new_run_folder, profile_of, show
 from stagectl.signals import Stop
 
 HARD_FLOATS = [0.1, 1 / 3, -0.0, 5e-324, 1.7976931348623157e308, 2.0**-1022, 123456789.12345679, 1e-9, np.nan, np.inf]
@@ -72,13 +72,45 @@ def test_list_tells_whole_crashed_living_and_damaged_runs(folder):
     whole = found[folder.name]
     assert (whole.state, whole.rows_count, whole.profile) == ("closed", 10, "oled-printer")
     assert whole.duration_s == pytest.approx(9e-3)
-    assert whole.stop == "no valid interferometer sample for too long"
+    assert (whole.stop, whole.text) == ("SENSOR_AGE", "no valid interferometer sample for too long")
     assert (found["crashed"].state, found["crashed"].rows_count) == ("crashed", 400)
     assert found["crashed"].duration_s == pytest.approx(0.399)
     assert found["living"].state == "recording"
     assert found["not-a-run"].state == "damaged"
     assert "manifest.json" in found["z-torn"].note
     assert list_runs(root / "nowhere") == []
+
+
+@pytest.mark.parametrize(
+    ("end", "stop", "text"),
+    [
+        ({"stop": "NONE", "detail": ""}, "NONE", "nothing stopped it"),
+        ({"stop": "OPERATOR", "detail": ""}, "OPERATOR", "the operator asked to stop"),
+        (
+            {"stop": "THERMAL", "detail": "micro at 81.0 N rms, limit 80 N; let it cool"},
+            "THERMAL",
+            "a motor reached its thermal limit: micro at 81.0 N rms, limit 80 N; let it cool",
+        ),
+        ({"stop": "NONE", "error": "DriveError: homing: no edge"}, "NONE", "DriveError: homing: no edge"),
+        ({"error": "RecordError: disk"}, "", "RecordError: disk"),
+        ({"stop": int(Stop.LEASE)}, "LEASE", "the lease on motion ran out"),
+        ({"stop": "OF_A_LATER_VERSION"}, "OF_A_LATER_VERSION", ""),
+        ({}, "", ""),
+    ],
+)
+def test_a_run_says_how_it_ended_with_its_numbers(end, stop, text):
+    assert ending({"end": end}) == (stop, text)
+
+
+def test_a_folder_of_runs_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RequestError, match="is a file"):
+        list_runs(tmp_path / "file")
+
+
+def test_a_profile_of_another_version_is_said(folder):
+    with pytest.raises(RecordError, match=r"manifest\.json: the profile in it can't be read by this version"):
+        profile_of(read_run(folder))
 
 
 def test_show_describes_a_run(folder):

@@ -7,7 +7,7 @@ import pytest
 
 from stagectl import tick, trajectory
 from stagectl.signals import MEASUREMENT, SETPOINT, Stop
-from tests.stage import simulated, with_values
+from tests.stage import followed, simulated, with_values
 from tests.stage_loop import Loop
 
 LAWS = tuple(tick.LAWS)
@@ -161,3 +161,70 @@ def test_the_drives_target_is_where_the_reference_will_be(oled_profile):
     mass_n = 70.0 * 1.0
     reaction_n = float(one.command["micro_force_asked_n"][0])
     assert one.command["macro_force_asked_n"][0] == pytest.approx(mass_n + reaction_n, abs=2.0)
+
+
+WEAK = -0.05
+
+
+def weak(model, *axes: str):
+    """Copy a profile or machine whose motors make 5 % less force than their current should."""
+    errors = ({"name": "force_constant_error", "acts_on": f"{axis}_actuator", "error_ratio": WEAK} for axis in axes)
+    return with_values(model, effects=(*model.effects, *errors))
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_what_a_weak_motor_is_asked_for_keeps_within_the_limit(oled_profile, oled_machine, law, sign):
+    """Both axes at their limits, 180 N and 300 N: asked F / (1 - 0.05) of a force cut too late would be 5 % beyond."""
+    profile = with_values(weak(oled_profile, "macro", "micro"), macro__force_limit_n=300.0)
+    loop = standing(profile, weak(oled_machine, "macro", "micro"), law)
+    accelerate = np.zeros(1, SETPOINT)
+    accelerate["acceleration_m_per_s2"] = sign * 20.0
+    loop.cycle(accelerate[0])
+    command = loop.simulation.controller.command[0]
+    assert command["stop"] == Stop.NONE
+    assert command["micro_force_asked_n"] == sign * 180.0
+    assert command["macro_force_asked_n"] == sign * 300.0
+
+
+@pytest.mark.parametrize("error", [-0.2, WEAK, 0.05, 0.2])
+def test_a_force_constant_error_is_undone_exactly(oled_profile, oled_machine, error):
+    """F / (1 + e), not F (1 - e): at -5 % that would be 0.25 % short."""
+    effect = {"name": "force_constant_error", "acts_on": "micro_actuator", "error_ratio": error}
+    profile, machine = (with_values(one, effects=(*one.effects, effect)) for one in (oled_profile, oled_machine))
+    loop = Loop(simulated(profile, machine, "dsmc"))
+    largest_n = 0.0
+    for setpoint in trajectory.trapezoid(0.05, 0.2, dwell_s=0.1, lead_s=0.1).setpoints:
+        loop.cycle(setpoint)
+        assert loop.stop == 0
+        wanted_n = float(loop.simulation.controller.law["last_force_n"][0])
+        asked_n = float(loop.simulation.controller.command["micro_force_asked_n"][0])
+        assert asked_n * (1.0 + error) == pytest.approx(wanted_n, rel=1e-12, abs=1e-12)
+        largest_n = max(largest_n, abs(wanted_n))
+    assert largest_n > 30.0
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_without_an_actuator_effect_the_law_has_the_last_word(oled_profile, oled_machine, law):
+    """To the last bit: what is asked is what the law answered, and at the limit the limit."""
+    loop = standing(oled_profile, oled_machine, law)
+    accelerate = np.zeros(1, SETPOINT)
+    for acceleration in (0.3, 20.0):
+        accelerate["acceleration_m_per_s2"] = acceleration
+        loop.cycle(accelerate[0])
+        if law == "dsmc":
+            controller = loop.simulation.controller
+            assert controller.command["micro_force_asked_n"][0] == controller.law["last_force_n"][0]
+    assert loop.simulation.controller.command["micro_force_asked_n"][0] == 180.0
+
+
+def test_a_saturated_law_on_weak_motors_ends_its_run(oled_profile, oled_machine):
+    """Over the value seam: 1 m/s^2 takes 40 N, a weak motor more than 41 N, which is the limit."""
+    profile = with_values(weak(oled_profile, "micro"), micro__force_limit_n=41.0)
+    rows = trajectory.trapezoid(0.2, 0.2, dwell_s=0.2, lead_s=0.2).setpoints
+    recording = followed(profile, weak(oled_machine, "micro"), "dsmc", rows)
+    asked_n = np.abs(recording.commands["micro_force_asked_n"])
+    assert recording.commands["stop"][-1] == Stop.NONE
+    assert recording.commands.size == rows.size
+    assert np.max(asked_n) == 41.0
+    assert np.count_nonzero(asked_n == 41.0) > 10

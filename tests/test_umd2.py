@@ -130,6 +130,47 @@ def test_environment():
     assert (environment.homodyne_axes_count, environment.counts_per_cycle_count) == (2.0, 4.0)
 
 
+def told(framer, pairs, first: int = 0) -> None:
+    """Feed lines that carry these low-speed codes and data."""
+    line = b"3000 3001 1000 0 0 %d %d %d 2999 -20 0 0 0 0 0 0\r\n"
+    framer.feed(b"".join(line % (first + k, *pair) for k, pair in enumerate(pairs)))
+
+
+def test_air_counts_when_it_was_said_twice_alike():
+    framer = heterodyne()
+    told(framer, [(0, 0), (0, 0), (3, 2015), (5, 101325), (6, 487)])
+    assert all(math.isnan(value) for value in framer.air.values())
+    told(framer, [(3, 2016), (5, 101325)], 5)
+    assert framer.air["temperature_degc"] == pytest.approx(20.16)
+    assert framer.air["pressure_pa"] == 101325.0
+    assert math.isnan(framer.air["relative_humidity_percent"])
+    assert framer.air_number == 2
+    told(framer, [(3, 2016)], 7)
+    assert framer.air_number == 2  # nothing new
+
+
+def test_a_wrong_digit_is_no_air():
+    framer = heterodyne()
+    told(framer, [(0, 0), (0, 0), (3, 2015), (3, 2015), (3, 6015), (3, 2015), (5, 101325), (5, 171325), (5, 101325)])
+    assert framer.air["temperature_degc"] == pytest.approx(20.15)
+    assert math.isnan(framer.air["pressure_pa"])
+    told(framer, [(5, 101326), (3, 9900000), (3, 2115), (3, 2116)], 9)
+    assert framer.air == pytest.approx(
+        {"temperature_degc": 21.16, "pressure_pa": 101326.0, "relative_humidity_percent": math.nan}, nan_ok=True
+    )
+
+
+def test_air_is_in_the_snapshot():
+    framer, other = heterodyne(), heterodyne()
+    told(framer, [(0, 0), (0, 0), (3, 2015), (3, 2015), (5, 101325)])
+    other.restore(framer.snapshot())
+    for one in (framer, other):
+        told(one, [(5, 101325), (3, 2020)], 5)
+    assert (other.air["temperature_degc"], other.air["pressure_pa"]) == pytest.approx((20.2, 101325.0))
+    assert other.air_number == framer.air_number == 3
+    assert other.snapshot() == framer.snapshot()
+
+
 def test_debug_lines_and_banner():
     framer = heterodyne()
     readings = framer.feed(b"uMD2 ready\r\n! debug 1 2 3\r\n" + LINE_7 + b"!\r\n" + LINE_8)

@@ -43,13 +43,36 @@ from stagectl.units import unit_of
         ("current_a", "A"),
         ("supply_v", "V"),
         ("inductance_h", "H"),
+        ("error_integral_m_s", "m s"),
+        ("impulse_n_s", "N s"),
+        ("torque_n_m", "N m"),
+        ("field_v_per_m", "V/m"),
+        ("density_kg_per_m_s", "kg/(m s)"),
+        ("torque_slope_n_m_per_a", "N m/A"),
+        ("noise_m_per_sqrt_hz", "m/sqrt(Hz)"),
+        ("macro_stiffness_per_s2", "1/s^2"),
+        ("counts_per_m", "counts/m"),
     ],
 )
 def test_ending_states_the_unit(name, unit):
     assert unit_of(name) == unit
 
 
-@pytest.mark.parametrize("name", ["position", "torque_nm", "speed_mm_per_sec", "m", "", "level_N", "gain"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "position",
+        "torque_nm",
+        "speed_mm_per_sec",
+        "speed_mm_per_s",
+        "speed_m_per",
+        "drift_n_per_sqrt",
+        "m",
+        "",
+        "level_N",
+        "gain",
+    ],
+)
 def test_a_name_without_a_unit_has_none(name):
     assert unit_of(name) is None
 

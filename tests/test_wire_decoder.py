@@ -1,8 +1,9 @@
-"""The decoder: when its bytes are taken changes nothing."""
+"""The decoder: when its bytes are taken changes nothing; the index of air follows the device's own air in a ramp."""
 
 import numpy as np
 import pytest
 
+from drivers.air import ciddor_index
 from drivers.wire import Inbox, WireDecoder
 from sim_backend.batch import BatchWire
 from sim_backend.machine import load_machine
@@ -44,3 +45,90 @@ def test_bytes_taken_before_the_cycle_is_due_give_the_same_measurements(name):
     assert early[0]["samples_new"].sum() > 590
     assert np.array_equal(early[0], late[0])
     assert np.array_equal(early[1], late[1])
+
+
+COUNTS = 5_000_000  # of 79.1 nm: 0.4 m
+LINE = b"2000 2000 %d 0 0 %d %d %d 2000 %d 0 0 0 0 0 0\r\n"
+HENE_M = 632.991e-9
+
+
+class Lines:
+    """A decoder that hears a uMD2 line a cycle, the stage at rest 0.4 m from its zeros."""
+
+    def __init__(self) -> None:
+        self.decoder = WireDecoder(load_profile("oled-printer-umd2"), {})
+        self.seen = fields(new(MEASUREMENT))
+        self.number = 0
+        self.hear()
+        self.hear()
+        self.decoder.set_zeros(0.0, 0.0)
+
+    def hear(self, code: int = 0, data: int = 0) -> float:
+        """Hear one line and return where the macro is; macro and end stand at opposite sides of zero."""
+        inbox = Inbox(t_ns=10**9 + self.number * MS + MS // 2)
+        line = LINE % (COUNTS, self.number, code, data, -COUNTS // 2)
+        inbox.add_sensor_bytes(line, 10**9 + self.number * MS + 150_000)
+        self.number += 1
+        assert self.decoder.decode(inbox, self.seen) == ""
+        return self.seen.macro_position_m
+
+
+def test_the_index_follows_the_devices_air_and_moves_no_position_by_more_than_a_tenth_of_a_nanometre_a_cycle():
+    """From the profile's 20 degC to 21 degC: 0.955e-6 of 0.4 m is 378 nm, 3780 cycles."""
+    lines = Lines()
+    warm = ciddor_index(HENE_M, 21.0, 101325.0, 50.0, 450.0)
+    assert lines.decoder.air_index == ciddor_index(HENE_M, 20.0, 101325.0, 50.0, 450.0)
+    before_m = lines.hear(3, 2100)
+    assert lines.hear(3, 2100) - before_m == pytest.approx(1e-10, rel=1e-3)  # less air, a longer wave: it grows
+    positions_m = [before_m, *(lines.hear() for _ in range(4000))]
+    assert np.max(np.abs(np.diff(positions_m[1:]))) <= 1.001e-10
+    assert lines.decoder.air_index == warm
+    assert positions_m[-1] == pytest.approx(COUNTS * HENE_M / (8.0 * warm), rel=1e-15)
+    assert lines.seen.end_position_m == pytest.approx(-0.5 * positions_m[-1], rel=1e-15)
+    assert positions_m[-1] - positions_m[0] == pytest.approx(378e-9, abs=2e-9)
+    assert 3700 < np.count_nonzero(np.diff(positions_m)) < 3860
+
+
+def test_pressure_and_humidity_count_as_well():
+    lines = Lines()
+    for code, data in ((5, 100325), (6, 400), (5, 100325), (6, 400)):
+        lines.hear(code, data)
+    for _ in range(12_000):
+        lines.hear()
+    assert lines.decoder.air_index == ciddor_index(HENE_M, 20.0, 100325.0, 40.0, 450.0)
+
+
+def test_flickering_last_digits_move_nothing():
+    """0.01 K and 1 Pa are 1.2e-8 of the index: less than Ciddor's equation knows it."""
+    lines = Lines()
+    at_m = lines.hear()
+    for _ in range(20):
+        for code, data in ((3, 2001), (5, 101326), (3, 2000), (5, 101325)):
+            assert lines.hear(code, data) == at_m
+
+
+def test_air_that_is_none_changes_nothing():
+    """150 kPa is within what a device may say, and outside Ciddor's range."""
+    lines = Lines()
+    at_m = lines.hear()
+    for _ in range(5):
+        assert lines.hear(5, 150_000) == at_m
+
+
+def test_a_decoder_goes_on_in_the_midst_of_a_ramp():
+    lines, other = Lines(), Lines()
+    for _ in range(3):
+        lines.hear(3, 2100)
+    other.decoder.restore(lines.decoder.snapshot())
+    other.number = lines.number
+    for _ in range(100):
+        assert other.hear() == lines.hear()
+    assert other.decoder.air_index == lines.decoder.air_index != ciddor_index(HENE_M, 20.0, 101325.0, 50.0, 450.0)
+
+
+def test_where_no_position_is_the_index_is_there_at_once():
+    lines = Lines()
+    lines.decoder.set_zeros(float(COUNTS), float(-COUNTS // 2))
+    lines.hear(3, 2100)
+    assert lines.hear(3, 2100) == 0.0
+    assert lines.decoder.air_index == ciddor_index(HENE_M, 21.0, 101325.0, 50.0, 450.0)

@@ -1,1 +1,20 @@
-"""What the commands do, behind their arguments; imported when a command runs, so that `--help` is quick."""
+"""What the commands do, behind their arguments; a module is imported when one of its commands runs.
+
+Importing all of them takes seconds; `stagectl --help` needs none.
+"""
+
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from stagectl.commands import demo, motion, planning, profiles, runs
+
+__all__ = ["demo", "motion", "planning", "profiles", "runs"]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Import a module of commands where it is first asked for."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return import_module(f"{__name__}.{name}")

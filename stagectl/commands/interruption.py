@@ -6,6 +6,14 @@ from types import FrameType
 _PATIENCE_S = 1.0
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C or SIGTERM, heard.
+
+    Not KeyboardInterrupt itself: where that passes through an import in C, CPython ends the process by SIGINT at last,
+    whatever exit code it was given (unhandled_keyboard_interrupt in its runtime).
+    """
+
+
 class Interruption:
     """A context in which the first signal becomes a KeyboardInterrupt from `check`, and later ones are ignored.
 
@@ -35,7 +43,7 @@ class Interruption:
         if self._asked and not self._raised:
             self._raised = True
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-            raise KeyboardInterrupt
+            raise Interrupted
 
     def hush(self) -> None:
         """Raise nothing from here on."""

@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from rich.markup import escape
+
 from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
 from stagectl.commands.opening import Place, home_and_arm, law_name, opened, place
-from stagectl.commands.planning import Shape, kind_of, planned
+from stagectl.commands.planning import Shape, kind_of, planned, target
 from stagectl.commands.scores_json import scores_json
 from stagectl.commands.tables import terminal
 from stagectl.errors import RequestError
@@ -13,7 +15,6 @@ from stagectl.record import read_run
 from stagectl.run_page import scores_of, tables
 from stagectl.run_scores import read_truth
 from stagectl.runs import new_run_folder
-from stagectl.signals import STOP_TEXT, Stop
 from stagectl.supervisor import Outcome, Supervisor
 
 
@@ -32,7 +33,7 @@ def run(
     law = law_name(law, where.profile)
     kind = kind_of(trajectory, shape)
     if kind == "move":
-        target_m = shape.target_m if shape.target_m is not None else 0.0
+        target_m = target(where.profile, shape)
         if where.is_value_seam:
             raise RequestError("a move needs a stage that stands somewhere; take --backend rig, or another trajectory")
         return _on_stage(where, voice, "move", law, lambda stage: stage.move(target_m, law))
@@ -45,7 +46,7 @@ def run(
 
 
 def identify(
-    voice: Voice, profile: str, backend: str, runs_root: Path, seed: int, frequency_hz: float, duration_s: float
+    voice: Voice, profile: str, backend: str, runs_root: Path, seed: int, frequency_hz: float | None, duration_s: float
 ) -> Answer:
     """Home, sweep the micro over both edges."""
     where = place(profile, backend, runs_root, seed)
@@ -97,7 +98,7 @@ def _on_stage(
             outcome = motion(stage)
         position_m = float(stage.status()["end_position_m"])
         folder = stage.folder
-    return _answer(voice, folder, outcome.stop, f"{outcome.name}: {outcome.text}", {"end_position_m": position_m})
+    return _answer(voice, folder, outcome, {"end_position_m": position_m, "remarks": stage.remarks})
 
 
 class _ValueSeam:
@@ -109,7 +110,7 @@ class _ValueSeam:
         self._where, self._folder, self._voice = where, folder, voice
         self._machine = load_machine(where.profile.name)
 
-    def follow(self, setpoints, name: str, law: str) -> Stop:
+    def follow(self, setpoints, name: str, law: str) -> Outcome:
         from stagectl.value_seam_run import simulate
 
         where = self._where
@@ -117,7 +118,7 @@ class _ValueSeam:
             where.profile, self._machine, setpoints, name, law, self._folder, where.seed, self._voice.progress
         )
 
-    def identify(self, frequency_hz: float, duration_s: float) -> Stop:
+    def identify(self, frequency_hz: float | None, duration_s: float) -> Outcome:
         from stagectl.value_seam_run import identify as sweep
 
         where = self._where
@@ -126,23 +127,23 @@ class _ValueSeam:
         )
 
 
-def _behind_value_seam(where: Place, voice: Voice, name: str, motion: Callable[[_ValueSeam], Stop]) -> Answer:
+def _behind_value_seam(where: Place, voice: Voice, name: str, motion: Callable[[_ValueSeam], Outcome]) -> Answer:
     """Simulate, record and score."""
     folder = new_run_folder(where.runs_root, name)
     voice.run_folder = folder
-    stop = motion(_ValueSeam(where, folder, voice))
-    return _answer(voice, folder, stop, f"{name}: {STOP_TEXT[stop]}", {})
+    return _answer(voice, folder, motion(_ValueSeam(where, folder, voice)), {})
 
 
-def _answer(voice: Voice, folder: Path, stop: Stop, text: str, facts: dict) -> Answer:
+def _answer(voice: Voice, folder: Path, outcome: Outcome, facts: dict) -> Answer:
     """Say how it ended, with the scores of what was recorded."""
     voice.progress("scoring", 0.0)
     run = read_run(folder)
     scores = scores_of(run, read_truth(folder))
     voice.progress.done()
-    finished = stop is Stop.FINISHED
+    text = f"{outcome.name}: {outcome.text}"
     shown: list = [terminal(table) for table in tables(scores)]
-    shown.append(text if finished else f"[red]ended early[/]: {text}")
-    shown += [f"run     {folder}", f"[dim]figures: stagectl runs plot {folder}[/]"]
-    data = {"run": folder, "stop": stop.name, "finished": finished, "text": text, **facts, **scores_json(scores)}
-    return Answer(data, shown, 0 if finished else ENDED_EARLY)
+    shown += [f"[yellow]{escape(remark)}[/]" for remark in facts.get("remarks", ())]
+    shown.append(escape(text) if outcome.finished else f"[red]ended early[/]: {escape(text)}")
+    shown += [f"run     {escape(str(folder))}", f"[dim]figures: stagectl runs plot {escape(str(folder))}[/]"]
+    facts = {"stop": outcome.stop.name, "finished": outcome.finished, "text": text, **facts}
+    return Answer({"run": folder, **facts, **scores_json(scores)}, shown, 0 if outcome.finished else ENDED_EARLY)

@@ -1,5 +1,6 @@
 """Open a stage for a command: progress and interrupts reach it, and whatever happens it comes to rest and is closed."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -9,7 +10,6 @@ from stagectl.commands.answer import Voice
 from stagectl.errors import RequestError, StagectlError
 from stagectl.profile import Profile, load_profile
 from stagectl.run_scores import VALUE_SEAM, write_truth
-from stagectl.signals import Stop
 from stagectl.stage import BACKENDS, open_stage
 from stagectl.suggestion import closest
 from stagectl.supervisor import Outcome, Supervisor
@@ -36,7 +36,17 @@ def place(profile: str, backend: str, runs_root: Path, seed: int) -> Place:
     known = (*BACKENDS, VALUE_SEAM)
     if backend not in known:
         raise RequestError(f"--backend {backend!r}: there is no such backend{closest(backend, known)}")
+    refuse_no_folder(runs_root)
     return Place(load_profile(profile), backend, runs_root, seed)
+
+
+def refuse_no_folder(runs_root: Path) -> None:
+    """Refuse a folder of runs that is a file, or lies below one, before anything moves. Errors: RequestError."""
+    standing = next(path for path in (runs_root, *runs_root.absolute().parents) if path.exists())
+    if not standing.is_dir():
+        raise RequestError(f"--runs {runs_root}: {standing} is a file; give a folder")
+    if not os.access(standing, os.W_OK | os.X_OK):
+        raise RequestError(f"--runs {runs_root}: {standing} can't be written; give another folder or its permissions")
 
 
 def law_name(asked: str | None, profile: Profile) -> str:
@@ -87,7 +97,4 @@ def _keep_truth(stage: Supervisor) -> None:
 def home_and_arm(stage: Supervisor, law: str | None = None) -> Outcome:
     """Home, then hold under a law; an Outcome that is not finished says why not."""
     homed = stage.home()
-    if not homed.finished:
-        return homed
-    stop = stage.enable(law)
-    return homed if stop is Stop.NONE else Outcome("enable", stop, homed.first_row, homed.rows)
+    return stage.armed(law) if homed.finished else homed

@@ -51,6 +51,18 @@ def kind_of(trajectory: str, shape: Shape) -> str:
     return kind
 
 
+def target(profile: Profile, shape: Shape) -> float:
+    """Return where a move goes, m; refused before anything opens, because homing is motion too."""
+    low_m, high_m = profile.macro.travel_m
+    target_m = math.nan if shape.target_m is None else shape.target_m
+    if not low_m <= target_m <= high_m:
+        raise RequestError(
+            f"--target-m is {target_m:g}, the travel of {profile.name} is [{low_m:g}, {high_m:g}] m; "
+            "give a position within it"
+        )
+    return target_m
+
+
 def planned(profile: Profile, trajectory: str, shape: Shape) -> trajectories.Trajectory:
     """Plan a trapezoid, a sine or a file's motion, and refuse before anything moves what the stage can't do."""
     plan = _planned(profile, trajectory, shape)
@@ -84,10 +96,12 @@ def _planned(profile: Profile, trajectory: str, shape: Shape) -> trajectories.Tr
         )
     amplitude_m = _or(shape.amplitude_m, min(0.4, 0.5 * _TRAVEL_SHARE * span_m))
     frequency_hz = _or(shape.frequency_hz, speed / (2.0 * math.pi * amplitude_m) if amplitude_m > 0.0 else 1.0)
+    if not 0.0 < frequency_hz < math.inf:
+        raise RequestError(f"--frequency-hz is {frequency_hz:g}; a finite number above 0 is needed")
     return trajectories.sine(
         amplitude_m,
         2.0 * math.pi * frequency_hz,
-        _or(shape.duration_s, 3.0 / frequency_hz if frequency_hz > 0.0 else 1.0),
+        _or(shape.duration_s, 3.0 / frequency_hz),
         _or(shape.start_m, middle_m),
         dt_s,
     )

@@ -21,12 +21,20 @@ def check(voice: Voice, profile: str) -> Answer:
         f"{len(found.effects)} effects; CAN at most {100.0 * load_ratio:.0f} % full",
         f"  [dim]{found.source_path}[/]",
     ]
+    limp, braking = found.limp_deceleration_m_per_s2, found.macro.stop_deceleration_m_per_s2
+    if limp is not None and not braking <= limp:
+        shown.insert(
+            2,
+            f"  [yellow]without a sensor[/] the macro brakes at {braking:g} m/s^2, and a limp micro keeps off its "
+            f"stops up to {limp:.2g} m/s^2 only: its stops must bear it",
+        )
     data = {
         "profile": found.name,
         "path": found.source_path,
         "sha256": found.sha256,
         "axes": list(found.axes),
         "worst_bus_load_ratio": load_ratio,
+        "limp_deceleration_m_per_s2": limp,
     }
     return Answer(data, shown)
 

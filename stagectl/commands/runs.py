@@ -3,13 +3,14 @@
 from dataclasses import asdict
 from pathlib import Path
 
+from rich.markup import escape
 from rich.table import Table
 
 from stagectl import runs
 from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
 from stagectl.errors import RecordError, RequestError
 from stagectl.record import MANIFEST, read_run, recover_orphans
-from stagectl.signals import STOP_TEXT, Stop
+from stagectl.signals import Stop, stop_sentence
 from stagectl.suggestion import closest
 
 LATEST = "latest"
@@ -26,6 +27,8 @@ def folder_of(run: str, runs_root: Path) -> Path:
     for folder in (Path(run), runs_root / run):
         if folder.is_dir():
             return folder
+    if Path(run).is_file():
+        raise RequestError(f"run {run!r} is a file; give the run's folder, that is {Path(run).parent}, or its name")
     known = [one.folder.name for one in runs.list_runs(runs_root)]
     hint = closest(run, known) if known else f"; {runs_root} holds no runs"
     raise RequestError(f"no run {run!r}, neither as a path nor in {runs_root}{hint}")
@@ -44,25 +47,22 @@ def names(voice: Voice, runs_root: Path) -> Answer:
                 voice.note(f"{ring}: {counts}")
             recovered.append({"ring": ring, **asdict(outcome)})
     found = runs.list_runs(runs_root)
-    table = Table("run", "state", "rows", "time", "profile", "ended", box=None, pad_edge=False, header_style="bold")
+    table = Table("run", "state", "rows", "time", "profile", box=None, pad_edge=False, header_style="bold")
+    for column in table.columns:
+        column.no_wrap = True
     for column in (2, 3):
         table.columns[column].justify = "right"
-    table.columns[0].no_wrap = True
+    endings = []
     for one in found:
         style = _STATE_STYLE.get(one.state, "red")
-        state = f"[{style}]{one.state}[/]"
-        duration = f"{one.duration_s:.1f} s"
-        table.add_row(one.folder.name, state, str(one.rows_count), duration, one.profile, one.note or _ending(one.stop))
+        state, duration = f"[{style}]{one.state}[/]", f"{one.duration_s:.1f} s"
+        table.add_row(escape(one.folder.name), state, str(one.rows_count), duration, escape(one.profile))
+        why = one.note or ("" if one.text == stop_sentence(Stop.NONE, "") else one.text)
+        if why:
+            endings.append(escape(f"{one.folder.name}: {why}"))
     shown = [table] if found else [f"{runs_root} holds no runs yet; `stagectl demo` makes one"]
+    shown += ["", "[bold]what ended them[/]", *endings] if endings else []
     return Answer({"runs": [asdict(one) for one in found], "recovered": recovered}, shown)
-
-
-def _ending(stop: str) -> str:
-    """Say why a run ended; nothing where somebody simply closed it."""
-    known = Stop.__members__.get(stop)
-    if known in (Stop.NONE, Stop.OPERATOR):
-        return ""
-    return stop if known is None else STOP_TEXT[known]
 
 
 def show(voice: Voice, run: str, runs_root: Path) -> Answer:
@@ -74,10 +74,16 @@ def show(voice: Voice, run: str, runs_root: Path) -> Answer:
     folder = folder_of(run, runs_root)
     found = runs.show(folder)
     facts = Table.grid(padding=(0, 2))
-    for name in ("folder", "state", "profile", "stop", "rows_count", "duration_s"):
-        value = found[name]
-        facts.add_row(f"[dim]{name}[/]", f"{value:.3f}" if isinstance(value, float) else str(value))
-    facts.add_row("[dim]world[/]", str(found["manifest"].get("backend_description", "")))
+    for name, text in (
+        ("folder", found["folder"]),
+        ("state", found["state"]),
+        ("ended", found["text"]),
+        ("profile", found["profile"]),
+        ("world", found["manifest"].get("backend_description", "")),
+        ("rows", str(found["rows_count"])),
+        ("time", f"{found['duration_s']:.3f} s"),
+    ):
+        facts.add_row(f"[dim]{name}[/]", escape(str(text)))
     facts.add_row("[dim]events[/]", ", ".join(f"{count} {name}" for name, count in found["events"].items()))
     if found["truncated"]:
         facts.add_row("[dim]end[/]", "[yellow]the files have no proper end: what is whole was read[/]")
@@ -85,6 +91,7 @@ def show(voice: Voice, run: str, runs_root: Path) -> Answer:
     shown: list = [facts]
     if scores is not None:
         shown += [terminal(table) for table in tables(scores)]
+        shown += [f"[red]ended early[/]: {escape(text)}" for text in scores.ended_early]
     return Answer({**found, "scores": None if scores is None else scores_json(scores)}, shown)
 
 
@@ -106,7 +113,7 @@ def _profile_table(manifest: dict) -> dict:
 
 def export(voice: Voice, run: str, runs_root: Path, file_format: str, columns: str | None, out: Path | None) -> Answer:
     """Write a run as csv, parquet or mat."""
-    names_wanted = [name.strip() for name in columns.split(",")] if columns else None
+    names_wanted = [name.strip() for name in columns.split(",")] if columns is not None else None
     path = runs.export(folder_of(run, runs_root), file_format, names_wanted, out)
     return Answer({"file": path, "size_bytes": path.stat().st_size}, [f"{path}  {path.stat().st_size / 1e6:.1f} MB"])
 
@@ -129,12 +136,14 @@ def plot(voice: Voice, run: str, runs_root: Path, out: Path | None) -> Answer:
     from stagectl.run_scores import read_truth
 
     folder = folder_of(run, runs_root)
+    target = out if out is not None else folder / "report.html"
+    if target.suffix not in (".html", ""):
+        raise RequestError(f"--out {target}: give a page (.html), or a folder for PNG files")
     voice.progress("reading and scoring", 0.0)
     found = read_run(folder)
     if "cycle" not in _profile_table(found.manifest):
         raise RequestError(f"{folder}: a table from elsewhere has no motions to plot; export it and plot its columns")
     scores = scores_of(found, read_truth(folder))
-    target = out if out is not None else folder / "report.html"
     voice.progress("drawing", 0.0)
     drawn = pictures(found, scores)
     if not drawn:
@@ -142,10 +151,8 @@ def plot(voice: Voice, run: str, runs_root: Path, out: Path | None) -> Answer:
     if target.suffix == ".html":
         page(found, scores, _title(found)).write(target)
         files = [target]
-    elif target.suffix == "":
-        files = _write_pictures(drawn, target)
     else:
-        raise RequestError(f"--out {target}: give a page (.html), or a folder for PNG files")
+        files = _write_pictures(drawn, target)
     voice.progress.done()
     return Answer({"run": folder, "files": files}, [str(file) for file in files])
 

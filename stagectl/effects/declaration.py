@@ -55,7 +55,7 @@ COMMAND_QUANTITIES = ("command_a", "t_s", "dt_s")
 SENSOR_QUANTITIES = ("position_m", "velocity_m_per_s", "acceleration_m_per_s2", "t_s", "dt_s")
 """What a sensor effect may depend on: true motion of the axis at the sample; `dt_s` since the sample before."""
 
-QUANTITIES_OF = {
+QUANTITIES_OF: dict[str, tuple[str, ...]] = {
     "macro_force": QUANTITIES,  # N, positive in the direction of positive position
     "micro_force": QUANTITIES,
     "joint": JOINT_QUANTITIES,  # N on the end, the opposite on the macro

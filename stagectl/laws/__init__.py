@@ -2,6 +2,8 @@
 
 init(profile) -> LAW array          parameters and state, named
 middle(after, later, q, l, dt_s)    motion at which known forces are taken (predicted or reference)
-precision(...)                      force of the axis that carries the end
-carrier(...)                        force of the macro under a micro
+precision(...)                      force of the axis that carries the end, between low_n and high_n
+carrier(...)                        force of the macro under a micro, likewise
+
+The bounds are what the motor makes at its limits, so that what is asked of it keeps within them.
 """

@@ -13,11 +13,17 @@ on the centre of the gap (for (21), E11) with the micro's reaction decoupled (26
 Pure; knows no bus and no clock.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stagectl import plant
 from stagectl.compiled import compiled
-from stagectl.laws.reference import gap_centre, limited
+from stagectl.laws.reference import between, gap_centre
+from stagectl.signals import Record
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 LAW = np.dtype(
     [
@@ -53,7 +59,7 @@ _PARK_BANDWIDTH_HZ = 15.0
 _BUMP_S = 0.02
 
 
-def init(profile) -> np.ndarray:
+def init(profile: "Profile") -> np.ndarray:
     """Make LAW from a profile's [control] and limits; state at rest."""
     law = np.zeros(1, LAW)
     control = profile.control
@@ -84,7 +90,7 @@ def init(profile) -> np.ndarray:
 
 
 @compiled
-def integrand(e, phi):
+def integrand(e: float, phi: float) -> float:
     """y(e) of (33), corrected: odd, slope 2 at 0, phi sgn e beyond phi."""
     if e >= phi:
         return phi
@@ -94,14 +100,28 @@ def integrand(e, phi):
 
 
 @compiled
-def middle(after, later, q, law, dt_s):
+def middle(after: Record, later: Record, q: Record, law: Record, dt_s: float) -> None:
     """Take known forces at the predicted motion, half a period after the command begins to act."""
     plant.half_step(after, q, dt_s, 0.0, 0.0, plant.BRIDGE_CURRENT, plant.BRIDGE_CURRENT)
 
 
 @compiled
-def precision(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
-    """Return the force of the axis that carries the end, N."""
+def precision(
+    law: Record,
+    ahead: Record,
+    after: Record,
+    seen: Record,
+    now: Record,
+    later: Record,
+    mass_kg: float,
+    known_n: float,
+    disturbance_n: float,
+    low_n: float,
+    high_n: float,
+    q: Record,
+    dt_s: float,
+) -> float:
+    """Return the force of the axis that carries the end, N, within what its motor makes at its limits."""
     known_n += disturbance_n
     acceleration = later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3
     e = ahead.end_position_m - later.position_m
@@ -130,7 +150,7 @@ def precision(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance
     law.started = 1.0
     asked_n = free_n + law.bump_n
     law.bump_n *= law.bump_decay_ratio
-    force_n = limited(asked_n, law.precision_force_limit_n)
+    force_n = between(asked_n, low_n, high_n)
     if force_n == asked_n and law.parked == 0.0:
         law.error_integral_m_s += integrand(e, law.phi_m) * dt_s
         ratio = s / law.adaptation_scale_m_per_s
@@ -145,11 +165,25 @@ def precision(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance
 
 
 @compiled
-def carrier(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
-    """Return the force of the macro that keeps the end in the middle of the gap, N."""
+def carrier(
+    law: Record,
+    ahead: Record,
+    after: Record,
+    seen: Record,
+    now: Record,
+    later: Record,
+    mass_kg: float,
+    known_n: float,
+    disturbance_n: float,
+    low_n: float,
+    high_n: float,
+    q: Record,
+    dt_s: float,
+) -> float:
+    """Return the force of the macro that keeps the end in the middle of the gap, N, within what its motor makes."""
     known_n += disturbance_n
     e = ahead.macro_position_m - (later.position_m - later.relative_position_m + gap_centre(q))
     de = ahead.macro_velocity_m_per_s - (later.velocity_m_per_s - later.relative_velocity_m_per_s)
     acceleration = later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
     wanted = acceleration - law.macro_stiffness_per_s2 * e - law.macro_damping_per_s * de
-    return limited(mass_kg * wanted - known_n, law.macro_force_limit_n)
+    return between(mass_kg * wanted - known_n, low_n, high_n)

@@ -9,10 +9,16 @@ k_p = w / 4, k_v = w, k_i = k_v w / 10 for a velocity loop of bandwidth w (Leonh
 chapter 15: spacing of cascaded loops). Pure; knows no bus and no clock.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stagectl.compiled import compiled
-from stagectl.laws.reference import gap_centre, limited
+from stagectl.laws.reference import between, gap_centre
+from stagectl.signals import Record
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 LAW = np.dtype(
     [
@@ -45,7 +51,7 @@ _INTEGRAL_RATIO = 0.1
 _FILTER_RATIO = 8.0  # the difference is smoothed this much above the velocity loop
 
 
-def init(profile) -> np.ndarray:
+def init(profile: "Profile") -> np.ndarray:
     """Make LAW from a profile's [control] and limits; state at rest."""
     law = np.zeros(1, LAW)
     control = profile.control
@@ -64,7 +70,7 @@ def init(profile) -> np.ndarray:
 
 
 @compiled
-def middle(after, later, q, law, dt_s):
+def middle(after: Record, later: Record, q: Record, law: Record, dt_s: float) -> None:
     """Take known forces at the reference: no noise, no feedback."""
     after.middle_end_position_m = later.position_m
     after.middle_end_velocity_m_per_s = later.velocity_m_per_s
@@ -78,8 +84,22 @@ def middle(after, later, q, law, dt_s):
 
 
 @compiled
-def precision(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
-    """Return the force of the axis that carries the end, N."""
+def precision(
+    law: Record,
+    ahead: Record,
+    after: Record,
+    seen: Record,
+    now: Record,
+    later: Record,
+    mass_kg: float,
+    known_n: float,
+    disturbance_n: float,
+    low_n: float,
+    high_n: float,
+    q: Record,
+    dt_s: float,
+) -> float:
+    """Return the force of the axis that carries the end, N, within what its motor makes at its limits."""
     error = now.position_m - seen.end_seen_m
     if law.started == 0.0:
         law.precision_error_m = error
@@ -96,15 +116,29 @@ def precision(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance
         + law.precision_integral_per_s2 * law.precision_integral_m
     )
     asked_n = mass_kg * wanted - known_n
-    force_n = limited(asked_n, law.precision_force_limit_n)
+    force_n = between(asked_n, low_n, high_n)
     if force_n == asked_n:
         law.precision_integral_m += velocity_error * dt_s
     return force_n
 
 
 @compiled
-def carrier(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n, q, dt_s):
-    """Return the force of the macro that keeps the end in the middle of the gap, N."""
+def carrier(
+    law: Record,
+    ahead: Record,
+    after: Record,
+    seen: Record,
+    now: Record,
+    later: Record,
+    mass_kg: float,
+    known_n: float,
+    disturbance_n: float,
+    low_n: float,
+    high_n: float,
+    q: Record,
+    dt_s: float,
+) -> float:
+    """Return the force of the macro that keeps the end in the middle of the gap, N, within what its motor makes."""
     error = now.position_m - now.relative_position_m + gap_centre(q) - seen.macro_seen_m
     if law.macro_started == 0.0:
         law.macro_error_m = error
@@ -121,7 +155,7 @@ def carrier(law, ahead, after, seen, now, later, mass_kg, known_n, disturbance_n
         + law.macro_integral_per_s2 * law.macro_integral_m
     )
     asked_n = mass_kg * wanted - known_n
-    force_n = limited(asked_n, law.macro_force_limit_n)
+    force_n = between(asked_n, low_n, high_n)
     if force_n == asked_n:
         law.macro_integral_m += velocity_error * dt_s
     return force_n
