@@ -232,7 +232,7 @@ class Evidence:
             step = (10.0, 10.0, 1e-8, 1e-8, 1.0)[index]
             changed = self.contact.copy()
             changed[index] += step
-            force = (_contact_along(cells, changed) - _contact_along(cells, self.contact)) / step
+            force = (_stops(r, speed, changed) - _stops(r, speed, self.contact)) / step
         return [to_samples(force), -to_samples(force), None, None]
 
     def effect_column(self, index):
@@ -257,17 +257,20 @@ class Evidence:
         if self.case.single:
             channels[0] = inertia
             return channels
+        # the believed spring and stops are evaluated where the sensors say the stages are, which may be the other side
+        # of an edge: a difference, no derivative
         r = run.samples[:, 7] - run.samples[:, 6]
-        stiffness = np.full(len(r), self.base[B["spring_stiffness_n_per_m"]])
-        stiffness += np.where(r > self.contact[3], self.contact[1], 0.0) + np.where(
-            r < -self.contact[2], self.contact[0], 0.0
-        )
-        sign = 1.0 if place == 1 else -1.0
-        between = sign * (stiffness * error)[1:-1]
-        between += sign * self.base[B["spring_damping_n_s_per_m"]] * (error[2:] - error[:-2]) / (2.0 * SAMPLE_S)
+        seen = r + error if place == 1 else r - error
+        between = (self._between(seen) - self._between(r))[1:-1]
         channels[0], channels[1] = -between, between
         channels[place] = channels[place] + inertia
         return channels
+
+    def _between(self, r):
+        """Force in N of spring, damper and stops on the macro axis at relative positions r in m, one a sample."""
+        speed = np.gradient(r, SAMPLE_S)
+        force = self.base[B["spring_stiffness_n_per_m"]] * r + self.base[B["spring_damping_n_s_per_m"]] * speed
+        return force + _stops(r, speed, self.contact)
 
     def law_channels(self, run, law, acts_on, values):
         """Channels of any law along a run's record."""
@@ -439,12 +442,12 @@ def _products(a, b):
 
 
 @njit(cache=True)
-def _contact_along(cells, contact):
+def _stops(r, speed, contact):
+    """Force in N of the stops on the macro axis at relative positions and speeds."""
     empty, mem = np.zeros(laws.PARAMETERS), np.zeros(laws.MEMORIES)
-    out = np.zeros(cells.shape[0])
-    for i in range(cells.shape[0]):
-        r, speed = cells[i, 2] - cells[i, 0], cells[i, 3] - cells[i, 1]
-        out[i] = contact_force(-1, empty, mem, 0.0, 0.0, r, speed, contact)
+    out = np.zeros(len(r))
+    for i in range(len(r)):
+        out[i] = contact_force(-1, empty, mem, 0.0, 0.0, r[i], speed[i], contact)
     return out
 
 
