@@ -190,13 +190,17 @@ class Evidence:
             channels[2 + place] = currents[1:-1]
         return channels
 
+    def _actuated(self, run, place):
+        """What a run's commands make without any effect: (mean current over cells, current at samples) in A."""
+        if (run.number, place) not in self._plain:
+            d, tau = self.base[B["macro_command_delay_s"] + place], self.base[B["macro_current_lag_s"] + place]
+            self._plain[run.number, place] = actuator(self._commands(run, place), d, tau, 0.0)
+        return self._plain[run.number, place]
+
     def _loop_channels(self, run, place, delay, lag, dead):
         """What a current loop slower by these makes."""
-        commands = self._commands(run, place)
+        plain, commands = self._actuated(run, place), self._commands(run, place)
         d, tau = self.base[B["macro_command_delay_s"] + place], self.base[B["macro_current_lag_s"] + place]
-        if (run.number, place) not in self._plain:
-            self._plain[run.number, place] = actuator(commands, d, tau, 0.0)
-        plain = self._plain[run.number, place]
         other = actuator(commands, d + delay, tau + lag, dead)
         constant = self.base[B["macro_force_constant_n_per_a"] + place]
         return self._drive_channels(run, place, constant * (other[0] - plain[0]), other[1] - plain[1])
@@ -259,16 +263,17 @@ class Evidence:
             return channels
         # the believed spring and stops are evaluated where the sensors say the stages are, which may be the other side
         # of an edge: a difference, no derivative
-        r = run.samples[:, 7] - run.samples[:, 6]
-        seen = r + error if place == 1 else r - error
-        between = (self._between(seen) - self._between(r))[1:-1]
+        cells, n = run.cells, len(error)
+        there = np.interp((np.arange(n * CELLS) + 0.5) / CELLS, np.arange(n), error if place == 1 else -error)
+        r, speed = cells[:, 2] - cells[:, 0], cells[:, 3] - cells[:, 1]
+        seen = self._between(r + there, speed + np.gradient(there, CELL_S))
+        between = to_samples(seen - self._between(r, speed))
         channels[0], channels[1] = -between, between
         channels[place] = channels[place] + inertia
         return channels
 
-    def _between(self, r):
-        """Force in N of spring, damper and stops on the macro axis at relative positions r in m, one a sample."""
-        speed = np.gradient(r, SAMPLE_S)
+    def _between(self, r, speed):
+        """Force in N of spring, damper and stops on the macro axis at relative positions in m and speeds in m/s."""
         force = self.base[B["spring_stiffness_n_per_m"]] * r + self.base[B["spring_damping_n_s_per_m"]] * speed
         return force + _stops(r, speed, self.contact)
 
@@ -285,10 +290,9 @@ class Evidence:
         if law.family == "actuator":
             x = run.cells[:, 2 * place]
             constant = self.base[B["macro_force_constant_n_per_a"] + place]
-            plain = run.cells[:, 4 + place]
-            return self._drive_channels(
-                run, place, _thrust_along(law.code, p, constant, plain / constant, x) - plain, None
-            )
+            currents = self._actuated(run, place)[0]
+            forces = _thrust_along(law.code, p, constant, currents, x) - constant * currents
+            return self._drive_channels(run, place, forces, None)
         if law.family == "sensor":
             return self._sensor_channels(run, place, self._reading_errors(run, law, place, p))
         forces = along(
