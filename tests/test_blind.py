@@ -407,6 +407,7 @@ CLOSED_LOOP = [
     ("viscous_friction", "micro_force", {"coefficient_n_s_per_m": 3.0}),
     ("flexible_mode", "micro_force", {"mass_fraction": 0.05, "frequency_hz": 30.0, "damping_ratio": 0.03}),
     ("command_delay", "macro_command", {"delay_s": 0.2e-3}),
+    ("amplifier_dead_band", "micro_actuator", {"current_a": 0.05}),
     ("sensor_delay", "end_sensor", {"delay_s": 0.2e-3}),
     ("scale_error", "end_sensor", {"relative": 1e-3}),
     ("soft_contact", "contact", {"knee_m": 20e-6}),
