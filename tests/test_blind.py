@@ -388,17 +388,18 @@ def balance(case, run):
     )
     inner = detection.to_samples(base[B["spring_stiffness_n_per_m"]] * r + base[B["spring_damping_n_s_per_m"]] * speed)
     inner += detection.to_samples(touch)
-    drives = []
+    drives, currents = [], []
     for place in range(2):
         commands = np.ascontiguousarray(
             run.samples[:, 2 + place] / run.control[C["macro_force_constant_n_per_a"] + place]
         )
-        cells, _ = detection.actuator(commands, base[B["macro_command_delay_s"] + place], base[14 + place], 0.0)
+        cells, asked = detection.actuator(commands, base[B["macro_command_delay_s"] + place], base[14 + place], 0.0)
+        currents.append((run.samples[:, 4 + place] - asked)[1:-1])
         drives.append(detection.to_samples(base[2 + place] * cells))
     masses = base[0], base[1] + run.payload_kg
     one = masses[0] * detection.second_difference(y[:, 0]) - drives[0] + base[16] * drives[1] - inner
     two = masses[1] * detection.second_difference(y[:, 1]) - drives[1] + inner
-    return [one, two, None, None]
+    return [one, two, *currents]
 
 
 CLOSED_LOOP = [
@@ -406,7 +407,9 @@ CLOSED_LOOP = [
     ("viscous_friction", "micro_force", {"coefficient_n_s_per_m": 3.0}),
     ("flexible_mode", "micro_force", {"mass_fraction": 0.05, "frequency_hz": 30.0, "damping_ratio": 0.03}),
     ("command_delay", "macro_command", {"delay_s": 0.2e-3}),
+    ("amplifier_dead_band", "micro_actuator", {"current_a": 0.05}),
     ("sensor_delay", "end_sensor", {"delay_s": 0.2e-3}),
+    ("scale_error", "end_sensor", {"relative": 1e-3}),
     ("soft_contact", "contact", {"knee_m": 20e-6}),
 ]
 
@@ -429,30 +432,17 @@ def test_the_closed_loop_shows_what_the_balance_says(touching, name, acts_on, va
     case.effects = [draw.Effect(laws.BY_NAME[name], acts_on, values)]
     case.runs = draw.simulate(case)
     evidence = detection.Evidence(case, case.runs, 150.0)
-    mark = evidence.whitened(
-        [
-            [*(channels[:2]), None, None]
-            for channels in ([c for c in evidence_channels(evidence, run)] for run in case.runs)
-        ]
-    )
+    mark = evidence.effect_column(0)
     before = evidence.whitened([balance(case, run) for run in without])
     after = evidence.whitened([balance(case, run) for run in case.runs])
     assert np.linalg.norm(after - before - mark) < 0.05 * np.linalg.norm(mark) + 0.5
-
-
-def evidence_channels(evidence, run):
-    """Channels of the first effect of a case in one run."""
-    effect = evidence.case.effects[0]
-    if effect.law.family == "sensor":
-        return evidence._sensor_channels(run, effect.place, run.errors[0])
-    return [detection.to_samples(run.marks[0][0]), detection.to_samples(run.marks[0][1]), None, None]
 
 
 def test_a_whitened_null_is_white(touching):
     """The balance of a null set, whitened by the stated spectra, has unit variance but for the taper's share."""
     runs = draw.simulate(touching, [])
     evidence = detection.Evidence(touching, runs)
-    white = evidence.whitened([balance(touching, run) for run in runs])
+    white = evidence.whitened([[*balance(touching, run)[:2], None, None] for run in runs])
     taper = evidence.gains[0][1]
     used = white[white != 0.0]
     assert np.mean(used**2) == pytest.approx(np.mean(taper**2), rel=0.05)

@@ -190,13 +190,17 @@ class Evidence:
             channels[2 + place] = currents[1:-1]
         return channels
 
+    def _actuated(self, run, place):
+        """What a run's commands make without any effect: (mean current over cells, current at samples) in A."""
+        if (run.number, place) not in self._plain:
+            d, tau = self.base[B["macro_command_delay_s"] + place], self.base[B["macro_current_lag_s"] + place]
+            self._plain[run.number, place] = actuator(self._commands(run, place), d, tau, 0.0)
+        return self._plain[run.number, place]
+
     def _loop_channels(self, run, place, delay, lag, dead):
         """What a current loop slower by these makes."""
-        commands = self._commands(run, place)
+        plain, commands = self._actuated(run, place), self._commands(run, place)
         d, tau = self.base[B["macro_command_delay_s"] + place], self.base[B["macro_current_lag_s"] + place]
-        if (run.number, place) not in self._plain:
-            self._plain[run.number, place] = actuator(commands, d, tau, 0.0)
-        plain = self._plain[run.number, place]
         other = actuator(commands, d + delay, tau + lag, dead)
         constant = self.base[B["macro_force_constant_n_per_a"] + place]
         return self._drive_channels(run, place, constant * (other[0] - plain[0]), other[1] - plain[1])
@@ -232,7 +236,7 @@ class Evidence:
             step = (10.0, 10.0, 1e-8, 1e-8, 1.0)[index]
             changed = self.contact.copy()
             changed[index] += step
-            force = (_contact_along(cells, changed) - _contact_along(cells, self.contact)) / step
+            force = (_stops(r, speed, changed) - _stops(r, speed, self.contact)) / step
         return [to_samples(force), -to_samples(force), None, None]
 
     def effect_column(self, index):
@@ -257,17 +261,21 @@ class Evidence:
         if self.case.single:
             channels[0] = inertia
             return channels
-        r = run.samples[:, 7] - run.samples[:, 6]
-        stiffness = np.full(len(r), self.base[B["spring_stiffness_n_per_m"]])
-        stiffness += np.where(r > self.contact[3], self.contact[1], 0.0) + np.where(
-            r < -self.contact[2], self.contact[0], 0.0
-        )
-        sign = 1.0 if place == 1 else -1.0
-        between = sign * (stiffness * error)[1:-1]
-        between += sign * self.base[B["spring_damping_n_s_per_m"]] * (error[2:] - error[:-2]) / (2.0 * SAMPLE_S)
+        # the believed spring and stops are evaluated where the sensors say the stages are, which may be the other side
+        # of an edge: a difference, no derivative
+        cells, n = run.cells, len(error)
+        there = np.interp((np.arange(n * CELLS) + 0.5) / CELLS, np.arange(n), error if place == 1 else -error)
+        r, speed = cells[:, 2] - cells[:, 0], cells[:, 3] - cells[:, 1]
+        seen = self._between(r + there, speed + np.gradient(there, CELL_S))
+        between = to_samples(seen - self._between(r, speed))
         channels[0], channels[1] = -between, between
         channels[place] = channels[place] + inertia
         return channels
+
+    def _between(self, r, speed):
+        """Force in N of spring, damper and stops on the macro axis at relative positions in m and speeds in m/s."""
+        force = self.base[B["spring_stiffness_n_per_m"]] * r + self.base[B["spring_damping_n_s_per_m"]] * speed
+        return force + _stops(r, speed, self.contact)
 
     def law_channels(self, run, law, acts_on, values):
         """Channels of any law along a run's record."""
@@ -282,10 +290,9 @@ class Evidence:
         if law.family == "actuator":
             x = run.cells[:, 2 * place]
             constant = self.base[B["macro_force_constant_n_per_a"] + place]
-            plain = run.cells[:, 4 + place]
-            return self._drive_channels(
-                run, place, _thrust_along(law.code, p, constant, plain / constant, x) - plain, None
-            )
+            currents = self._actuated(run, place)[0]
+            forces = _thrust_along(law.code, p, constant, currents, x) - constant * currents
+            return self._drive_channels(run, place, forces, None)
         if law.family == "sensor":
             return self._sensor_channels(run, place, self._reading_errors(run, law, place, p))
         forces = along(
@@ -439,12 +446,12 @@ def _products(a, b):
 
 
 @njit(cache=True)
-def _contact_along(cells, contact):
+def _stops(r, speed, contact):
+    """Force in N of the stops on the macro axis at relative positions and speeds."""
     empty, mem = np.zeros(laws.PARAMETERS), np.zeros(laws.MEMORIES)
-    out = np.zeros(cells.shape[0])
-    for i in range(cells.shape[0]):
-        r, speed = cells[i, 2] - cells[i, 0], cells[i, 3] - cells[i, 1]
-        out[i] = contact_force(-1, empty, mem, 0.0, 0.0, r, speed, contact)
+    out = np.zeros(len(r))
+    for i in range(len(r)):
+        out[i] = contact_force(-1, empty, mem, 0.0, 0.0, r[i], speed[i], contact)
     return out
 
 
