@@ -10,16 +10,16 @@ from stagectl.gap.believed import Believed
 from stagectl.gap.workflow import Findings, Named
 
 
-def effects_with(believed: Believed, findings: Findings, named: tuple[Named, ...], session: str) -> list[dict[str, Any]]:
+def effects_with(
+    believed: Believed, findings: Findings, named: tuple[Named, ...], session: str
+) -> list[dict[str, Any]]:
     """Return the belief's effects as refitted, and those of `named`, with the phases of one session."""
     found: list[dict[str, Any]] = []
     for row in believed.effects:
         error = findings.refitted.get(f"{row['name']} on {row['acts_on']}", 0.0)
         scaled = {name: row[name] * (1.0 + error) for name in CATALOGUE[row["name"]].linear}
         found.append({**row, **scaled})
-    for effect in named:
-        found.append(table_of(effect, session))
-    return found
+    return found + [table_of(effect, session) for effect in named]
 
 
 def table_of(effect: Named, session: str) -> dict[str, Any]:

@@ -21,6 +21,7 @@ BAND_HZ = 80.0
 _LEAST_LAP = 200  # samples
 _LAP_REACH = 100
 _SAME_RATIO = 1e-3
+_CONTROLLER_RATIO = 0.02
 _FREE = 1e9  # of limits that an observed machine has none of
 _CIRCUIT = {"resistance_ohm": 1.0, "inductance_h": 1e-3, "supply_v": _FREE, "current_limit_a": _FREE}
 
@@ -102,10 +103,36 @@ def simulate(believed: Believed, effects: list[dict[str, Any]], log: Log, mass_r
     extra = np.zeros(log.samples_count) if log.command_extra_n is None else log.command_extra_n
     module.follow(
         log.reference_m, extra, state, parameters, compose.effect_parameters(effects), log.period_s,
-        max(believed.macro.latch_s, 0.0), 0.25 * log.period_s, cascade.position_gain_per_s, cascade.velocity_gain_n_s_per_m,
-        cascade.limit_n, believed.macro.force_constant_n_per_a, positions, commands,
+        max(believed.macro.latch_s, 0.0), 0.25 * log.period_s, cascade.position_gain_per_s,
+        cascade.velocity_gain_n_s_per_m, cascade.limit_n, believed.macro.force_constant_n_per_a, positions, commands,
     )  # fmt: skip
     return Closed(positions, commands)
+
+
+def cannot_close(believed: Believed, log: Log) -> str:
+    """Say why the closed loop of a log can't be simulated, empty where it can.
+
+    A controller that does not give the recorded commands from the recorded positions is not the one that ran.
+    """
+    if believed.cascade is None or log.reference_m is None or believed.micro is not None:
+        return f"{log.name}: no controller of one axis and reference are known; the closed loop is not simulated"
+    cascade = believed.cascade
+    means_m = 0.5 * (log.macro_position_m + np.concatenate([log.macro_position_m[:1], log.macro_position_m[:-1]]))
+    speed = np.diff(means_m, prepend=means_m[0]) / log.period_s
+    force_n = cascade.velocity_gain_n_s_per_m * (
+        cascade.position_gain_per_s * (log.reference_m - log.macro_position_m) - speed
+    )
+    force_n = np.clip(force_n, -cascade.limit_n, cascade.limit_n)
+    if log.command_extra_n is not None:
+        force_n = force_n + log.command_extra_n
+    settle = round(0.5 / log.period_s)
+    misfit = _rms((log.macro_command_n - force_n)[settle:]) / max(_rms(log.macro_command_n[settle:]), 1e-300)
+    if not misfit <= _CONTROLLER_RATIO:
+        return (
+            f"{log.name}: the controller of the profile gives other commands than recorded ({misfit:.1%} of them, "
+            f"limit {_CONTROLLER_RATIO:.0%}); the closed loop is not simulated"
+        )
+    return ""
 
 
 def gap_of(log: Log, simulated: Closed) -> Gap:

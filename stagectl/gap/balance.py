@@ -48,7 +48,7 @@ class Recording:
     side: np.ndarray | None
     filters: dict[str, tuple[Noise, np.ndarray, np.ndarray]]
     judged: dict[str, np.ndarray]
-    known: dict[tuple[str, str], dict[str, np.ndarray]]  # quantities by axis and kind of place, once they were asked for
+    known: dict[tuple[str, str], dict[str, np.ndarray]]  # quantities by axis and kind of place, once asked for
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -146,7 +146,7 @@ def whitened(recording: Recording, axis: str, force_n: np.ndarray | None, positi
 
 
 def column(recording: Recording, forces: Forces) -> np.ndarray:
-    """Return what unit forces and sensor errors, unknown to the filter, add to the stacked innovations of all bodies."""
+    """Return what forces and sensor errors that the filter knows nothing of add to the innovations of all bodies."""
     parts = []
     for axis, force_n, sensor_m in (
         ("macro", forces.macro_n, forces.macro_sensor_m),
@@ -272,9 +272,8 @@ def effect_forces(recording: Recording, effect: Effect, place: str, parameters: 
     if place.endswith("_sensor"):
         return _misread(recording, axis, value)
     if place.endswith("_command"):
-        value = lagged(
-            value * recording.force_constant_n_per_a(axis), recording.belief(axis).current_loop_s, recording.log.period_s
-        )
+        belief = recording.belief(axis)
+        value = lagged(value * belief.force_constant_n_per_a, belief.current_loop_s, recording.log.period_s)
     return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
 
 
@@ -284,9 +283,9 @@ def _misread(recording: Recording, axis: str, error_m: np.ndarray) -> Forces:
     joint = recording.believed.joint
     forces = Forces(macro_sensor_m=sampled_m) if axis == "macro" else Forces(end_sensor_m=sampled_m)
     if joint is not None and recording.side is not None:
-        stiffness = joint.spring_n_per_m + np.where(
-            recording.side > 0.0, joint.right_stiffness_n_per_m, np.where(recording.side < 0.0, joint.left_stiffness_n_per_m, 0.0)
-        )
+        left = np.where(recording.side < 0.0, joint.left_stiffness_n_per_m, 0.0)
+        right = np.where(recording.side > 0.0, joint.right_stiffness_n_per_m, 0.0)
+        stiffness = joint.spring_n_per_m + left + right
         forces.end_n = stiffness * error_m * (1.0 if axis == "end" else -1.0)
         forces.macro_n = -forces.end_n
     return forces

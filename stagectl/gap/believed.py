@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from stagectl import toml_file
 from stagectl.effect_table import EffectTable, without_micro
 from stagectl.profile import Profile, load_profile
-from stagectl import toml_file
 from stagectl.toml_file import Document, Table, above, refuse, within
 
 FORCE_CONSTANT_SD_RATIO = 0.01
@@ -87,7 +87,8 @@ class CycleTable(Table):
     """The sampling of a machine that something else drives."""
 
     rate_hz: Annotated[float, within(10.0, 20e3)]
-    latch_s: Annotated[float, within(-0.01, 0.1)]  # sample instant -> middle of what the command's hold begins with
+    latch_s: Annotated[float, within(-0.01, 0.1)]  # sample instant -> the drive takes over the command of the same row
+    latch_sd_s: Annotated[float, above(0.0, 0.01)] = LATCH_SD_S
 
 
 class BodyTable(Table):
@@ -153,7 +154,12 @@ def believed_of_observed(machine: ObservedMachine) -> Believed:
         name=machine.name,
         period_s=1.0 / machine.cycle.rate_hz,
         macro=BelievedAxis(
-            body.mass_kg, body.mass_sd_kg, machine.sensor.noise_m, body.current_loop_s, latch_s=machine.cycle.latch_s
+            body.mass_kg,
+            body.mass_sd_kg,
+            machine.sensor.noise_m,
+            body.current_loop_s,
+            latch_s=machine.cycle.latch_s,
+            latch_sd_s=machine.cycle.latch_sd_s,
         ),
         effects=tuple(dict(row) for row in machine.effects),
         cascade=cascade,

@@ -37,7 +37,7 @@ def grids_for(recordings: list[Recording]) -> Grid:
         "current_loop_lag": [{"time_constant_s": 1e-4}],
         "command_delay": [{"delay_s": 1e-4}],
         "flexible_mode": [
-            {"share_ratio": 0.02, "frequency_hz": float(f), "damping_ratio": d} for f in np.geomspace(8.0, 200.0, 14) for d in (0.02,)
+            {"share_ratio": 0.02, "frequency_hz": float(f), "damping_ratio": 0.02} for f in np.geomspace(8.0, 200.0, 14)
         ],
         "sensor_delay": [{"delay_s": 1e-5}],
         "sensor_lag": [{"time_constant_s": 1e-4}],

@@ -15,7 +15,6 @@ from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.motion import delayed, lagged
 
 
-
 @dataclass(frozen=True, slots=True)
 class Term:
     """One hypothesis: the columns of one effect with its shape fixed."""
@@ -97,9 +96,7 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
                 return np.where(r.side == sign, -sign * stiffness, 0.0)
 
             known(f"{side}_stiffness_n_per_m", getattr(joint, f"{side}_stiffness_sd_ratio"), _joint(push))
-            found.append(
-                (Term(f"{side}_m", "parameter", {}, ("error_m",), _as_list(_joint(edge))), joint.width_sd_m)
-            )
+            found.append((Term(f"{side}_m", "parameter", {}, ("error_m",), _as_list(_joint(edge))), joint.width_sd_m))
     for axis, side in (("macro", "macro"), ("end", "micro")):
         if axis in recording.axes:
             belief = recording.belief(axis)
@@ -110,7 +107,9 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
         effect = CATALOGUE[row["name"]]
         values = [row[name] for name in effect.parameters]
 
-        def existing(r: Recording, effect: Effect = effect, place: str = row["acts_on"], values: list = values) -> Forces:
+        def existing(
+            r: Recording, effect: Effect = effect, place: str = row["acts_on"], values: list[float] = values
+        ) -> Forces:
             return balance.effect_forces(r, effect, place, values)
 
         name = f"{row['name']} on {row['acts_on']}"
@@ -230,8 +229,7 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
 
     def forces(r: Recording) -> list[Forces]:
         return [
-            balance.effect_forces(r, effect, place, [values[name] for name in effect.parameters])
-            for values in settings
+            balance.effect_forces(r, effect, place, [values[name] for name in effect.parameters]) for values in settings
         ]
 
     scope = "structural"
@@ -239,7 +237,7 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
         if tag in effect.tags.values():
             scope = tag
     bounds = (
-        tuple((-effect.bounds[name.removesuffix("*")][1], effect.bounds[name.removesuffix("*")][1]) for name in amplitudes)
+        tuple((-high, high) for high in (effect.bounds[name.removesuffix("*")][1] for name in amplitudes))
         if any(name.endswith("*") for name in amplitudes)
         else tuple(effect.bounds[name] for name in linear) or (_share_bounds(effect, shape),)
     )
@@ -262,7 +260,7 @@ def phase_of(effect: Effect, amplitude: str) -> str | None:
 
 
 _KNOTS_COUNT = 12
-_CURVES = ("position_m", "velocity_m_per_s", "acceleration_m_per_s2", "t_s")
+_CURVES = ("position_m", "velocity_m_per_s", "t_s")  # not acceleration: its line is a mass, and shrinks any rest
 
 
 def curve_terms(recordings: list[Recording]) -> Iterator[Term]:
@@ -276,7 +274,9 @@ def curve_terms(recordings: list[Recording]) -> Iterator[Term]:
                 continue
             knots = np.linspace(low, high, _KNOTS_COUNT)
 
-            def forces(r: Recording, axis: str = axis, quantity: str = quantity, knots: np.ndarray = knots) -> list[Forces]:
+            def forces(
+                r: Recording, axis: str = axis, quantity: str = quantity, knots: np.ndarray = knots
+            ) -> list[Forces]:
                 value = balance.quantities(r, axis, "macro_force")[quantity]
                 hats = [np.interp(value, knots, np.eye(_KNOTS_COUNT)[k]) for k in range(_KNOTS_COUNT)]
                 return [Forces(macro_n=hat) if axis == "macro" else Forces(end_n=hat) for hat in hats]
@@ -284,5 +284,3 @@ def curve_terms(recordings: list[Recording]) -> Iterator[Term]:
             place = "macro_force" if axis == "macro" else "micro_force"
             names = tuple(f"{knot:.6g}" for knot in knots)
             yield Term(f"curve over {quantity}", place, {}, names, forces)
-
-

@@ -119,7 +119,8 @@ def _log_of_rows(rows: np.ndarray, name: str, period_s: float, session: str, imp
     if not np.ptp(command) > 0.0:
         raise RecordError(f"{name}: macro_force_n is constant; swapped columns, or the stage was not driven")
     if not np.ptp(macro) > _STILL_M:
-        remarks.append(f"{name}: the macro moved by {np.ptp(macro) * 1e6:.1f} um only; what depends on motion is not seen")
+        moved_um = np.ptp(macro) * 1e6
+        remarks.append(f"{name}: the macro moved by {moved_um:.1f} um only; what depends on motion is not seen")
     if np.ptp(macro) > _MILLIMETRES_SPAN:
         raise RecordError(
             f"{name}: macro_position_m spans {np.ptp(macro):.3g} m; are these millimetres? Give the unit in the import"
@@ -152,8 +153,8 @@ def _check_times(t_ns: np.ndarray, period_s: float, name: str) -> None:
     wrong = np.flatnonzero(np.abs(steps_s - period_s) > 0.5 * period_s)
     if wrong.size:
         raise RecordError(
-            f"{name}: time jumps by {steps_s[wrong[0]] * 1e3:.4g} ms at row {int(wrong[0])}, {wrong.size} times in all; "
-            "cut the recording there"
+            f"{name}: time jumps by {steps_s[wrong[0]] * 1e3:.4g} ms at row {int(wrong[0])}, {wrong.size} times in "
+            "all; cut the recording there"
         )
 
 

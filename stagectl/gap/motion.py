@@ -7,7 +7,7 @@ an interval, and reversals and standstill themselves are left to the simulation 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import savgol_filter
+from scipy.signal import lfilter, savgol_filter
 
 PARTS_COUNT = 4
 """Parts of a sample interval: friction on whole milliseconds left 57 times its noise, on quarters 8 (prototype)."""
@@ -30,9 +30,9 @@ class Motion:
 
 def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motion:
     """Smooth positions (cubic over 21 samples) and put them on parts of intervals."""
-    x = savgol_filter(position_m, 7, _ORDER)
-    v = savgol_filter(position_m, _WINDOW, _ORDER, deriv=1, delta=period_s)
-    a = savgol_filter(position_m, _WINDOW + 10, _ORDER, deriv=2, delta=period_s)
+    x = np.asarray(savgol_filter(position_m, 7, _ORDER))
+    v = np.asarray(savgol_filter(position_m, _WINDOW, _ORDER, deriv=1, delta=period_s))
+    a = np.asarray(savgol_filter(position_m, _WINDOW + 10, _ORDER, deriv=2, delta=period_s))
     share = (np.arange(PARTS_COUNT) + 0.5) / PARTS_COUNT
     following = np.minimum(np.arange(x.size) + 1, x.size - 1)
 
@@ -51,7 +51,7 @@ def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motio
 
 
 def delayed(command: np.ndarray, latch_ratio: float) -> np.ndarray:
-    """Return a held command on parts of intervals where it takes over `latch_ratio` periods after its sample, (n, parts).
+    """Return a held command on parts of intervals, (n, parts): it takes over `latch_ratio` periods after its sample.
 
     Before the first command acts the first is taken.
     """
@@ -72,8 +72,6 @@ def lagged(fine: np.ndarray, lag_s: float, period_s: float) -> np.ndarray:
     dt_s = period_s / fine.shape[1]
     decay = float(np.exp(-dt_s / lag_s))
     mean_share = (1.0 - decay) * lag_s / dt_s
-    from scipy.signal import lfilter
-
     ends = lfilter([1.0 - decay], [1.0, -decay], flat, zi=[decay * flat[0]])[0]
     starts = np.concatenate([[flat[0]], ends[:-1]])
     return (flat + (starts - flat) * mean_share).reshape(fine.shape)

@@ -91,7 +91,12 @@ def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
 
 def within_bounds(solution: Solution) -> bool:
     """Tell whether no amplitude is outside what its effect can be, by more than twice its standard deviation."""
-    allowed = {column: bounds for group in solution.groups for column, bounds in zip(group.columns, group.bounds)}
+    allowed = {
+        column: bounds
+        for group in solution.groups
+        if group.bounds
+        for column, bounds in zip(group.columns, group.bounds, strict=True)
+    }
     for (column, _), value, variance in zip(solution.slots, solution.values, np.diag(solution.covariance), strict=True):
         if column in allowed:
             low, high = allowed[column]
@@ -193,6 +198,7 @@ class Judge:
     def select(self, most: int = 8) -> list[Group]:
         """Add the best term as long as one stays, then take back what the others have made superfluous."""
         chosen: list[Group] = []
+        seen: set[frozenset[tuple[int, ...]]] = set()
         while len(chosen) < most:
             left = self.reducible(chosen)
             ranked = []
@@ -212,6 +218,10 @@ class Judge:
                 break
             chosen.append(best[2])
             chosen = self._without_superfluous(self._swapped(chosen))
+            state = frozenset(group.columns for group in chosen)
+            if state in seen:  # what was added is taken back again
+                break
+            seen.add(state)
         return self._simplest(chosen)
 
     def _price(self) -> float:
@@ -229,7 +239,7 @@ class Judge:
         return all(within_bounds(solve([*self.base, *groups], part)) for part in (self.training, everything))
 
     def _swapped(self, chosen: list[Group]) -> list[Group]:
-        """Exchange single terms for no less simple ones as long as that is worth more: the first need not be the true."""
+        """Exchange terms for ones as simple as long as that is worth more: what came first need not be true."""
         for _ in range(2 * len(chosen)):
             now, best, better = self._worth(chosen), chosen, 0.0
             for k, group in enumerate(chosen):
@@ -255,14 +265,14 @@ class Judge:
                 if other.complexity >= group.complexity or other.key in {g.key for g in rest}:
                     continue
                 instead = [*chosen[:k], other, *chosen[k + 1 :]]
-                if now - sum(self.gains(instead)) < max(ALIAS_GAIN, _ALIAS_SHARE * (now - without)):
-                    if self._allowed(instead):
-                        chosen = instead
-                        break
+                loss = now - sum(self.gains(instead))
+                if loss < max(ALIAS_GAIN, _ALIAS_SHARE * (now - without)) and self._allowed(instead):
+                    chosen = instead
+                    break
         return chosen
 
     def _agrees(self, chosen: Sequence[Group], group: Group) -> bool:
-        """Tell whether training and held-out recordings ask for the same amplitudes: a law does not change with them."""
+        """Tell whether training and held-out recordings ask for the same amplitudes: a law is one law."""
         if not self.held or group.scope != "structural":
             return True
         values = [solve([*self.base, *chosen, group], part).of(group) for part in (self.training, self.held)]
@@ -273,7 +283,8 @@ class Judge:
     def _stays(self, trained: float, apart: float, left: tuple[float, float]) -> bool:
         """Tell whether gains are beyond noise, and material beside what is left, on whichever side more is left."""
         before = self.reducible([])
-        share = MATERIAL_RATIO * max(now / first if first > 0.0 else 0.0 for now, first in zip(left, before, strict=True))
+        shares = [now / first if first > 0.0 else 0.0 for now, first in zip(left, before, strict=True)]
+        share = MATERIAL_RATIO * max(shares)
         return trained > max(self.thresholds[0], share * before[0]) and apart > max(
             self.thresholds[1], share * before[1]
         )
@@ -340,7 +351,8 @@ class _Fold:
         if not np.all(scale > 0.0):
             return np.zeros(right.shape[1]), np.zeros(right.shape[1])
         weights = np.outer(scale, scale)
-        values = np.linalg.solve(normal / weights + _JITTER * np.eye(scale.size), right / scale[:, None]) / scale[:, None]
+        scaled = normal / weights + _JITTER * np.eye(scale.size)
+        values = np.linalg.solve(scaled, right / scale[:, None]) / scale[:, None]
         together = np.vstack([self._values - back @ values, values])
         gain = np.einsum("ij,ij->j", right, values)
         return gain, self._judged_gain([*self._slots, *slots], together) - self._apart

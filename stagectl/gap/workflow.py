@@ -85,7 +85,7 @@ def find(
     seed: int = 0,
     say: Say = lambda text: None,
 ) -> Findings:
-    """Find what is missing from a believed machine. Errors: RequestError where logs and belief can't belong together."""
+    """Find what is missing from a believed machine. Errors: RequestError where a log is on both sides."""
     if {log.name for log in training} & {log.name for log in held}:
         raise RequestError("a recording is both training and holdout; give recordings that no fit sees as --holdout")
     logs = [*training, *held]
@@ -266,7 +266,7 @@ def _whitened_sums(
         start += size
         rest = _rest(block, prior_sds)
         coefficients, sd = _autoregression(rest)
-        block = lfilter(np.concatenate([[1.0], -coefficients]), [1.0], block, axis=0)[_AR_ORDER:] / sd
+        block = np.asarray(lfilter(np.concatenate([[1.0], -coefficients]), [1.0], block, axis=0))[_AR_ORDER:] / sd
         gram += block.T @ block
         nulls += random.standard_normal((nulls_count, block.shape[0])) @ block[:, 1:]
         count += block.shape[0]
@@ -382,9 +382,9 @@ def _unknown(judge: Judge, chosen: list[Group], curves: list[Group], layout: Lay
         gains = judge.gains([*chosen, curve])
         gain = (gains[0] - now[0], gains[1] - now[1])
         free = 2.0 * len(curve.columns)
-        if gain[0] > judge.thresholds[0] + free and gain[1] > max(judge.thresholds[1], _UNKNOWN_SHARE * left[1]):
-            if best is None or gain[1] > best[1][1]:
-                best = (curve, gain)
+        passes = gain[0] > judge.thresholds[0] + free and gain[1] > max(judge.thresholds[1], _UNKNOWN_SHARE * left[1])
+        if passes and (best is None or gain[1] > best[1][1]):
+            best = (curve, gain)
     if best is None:
         return None
     curve, gain = best
