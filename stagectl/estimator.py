@@ -39,7 +39,7 @@ ESTIMATOR = np.dtype(
         ("position_mode", "f8"),  # 1 where the macro's drive closes its own position loop (CSP with torque offset)
         ("started", "f8"),
         ("cycle", "f8"),  # of the last tick
-        ("predicted_samples", "f8"),  # in a row without a fresh sample
+        ("predicted_samples", "f8"),  # periods since the sample that the model was corrected with last
         ("macro_word", "f8"),  # latched by the last SYNC
         ("micro_word", "f8"),
         ("macro_word_before", "f8"),  # latched by the SYNC before

@@ -150,13 +150,13 @@ def _motion_stop(g: Record, m: Record, now: Record) -> int:
         g.macro_position_m = m.macro_position_m
         g.macro_velocity_m_per_s = now.velocity_m_per_s
         g.cycle = m.cycle
-    elapsed = m.cycle - g.cycle
+    elapsed = m.sequence - g.cycle
     fresh = m.samples_new > 0 and m.sequence == m.cycle
-    if elapsed > 0 and fresh:
+    if elapsed > 0 and m.samples_new > 0:  # a late line too: its own number says over which time the way went
         rate = (m.macro_position_m - g.macro_position_m) / (elapsed * g.period_s)
         g.macro_velocity_m_per_s += g.velocity_share * (rate - g.macro_velocity_m_per_s)
         g.macro_position_m = m.macro_position_m
-        g.cycle = m.cycle
+        g.cycle = m.sequence
     if g.has_micro != 0.0 and not g.stroke_low_m <= m.end_position_m - m.macro_position_m <= g.stroke_high_m:
         return _MICRO_STROKE
     if g.braking != 0.0:

@@ -44,8 +44,13 @@ def estimate(m, e, model, ahead, b, q, p):
             x.macro_word = m.macro_reported_force_n / (x.macro_amperes_per_word * q[0].macro_force_constant_n_per_a)
             x.macro_word_before = x.macro_word
         periods = int(min(m.cycle - x.cycle, 50.0))
-        fresh = m.samples_new > 0 and m.sequence == m.cycle
-        x.predicted_samples = 0.0 if fresh else x.predicted_samples + periods
+        # A late line is of a sample before this cycle's: it corrects the model at its own instant, on the way here.
+        # Left out, lines that always came late left the loop open, and the forces grew to their limits in 100 ms.
+        due = int(m.sequence - x.cycle) if m.samples_new > 0 else -1
+        x.predicted_samples = periods - due if 0 <= due <= periods else x.predicted_samples + periods
+        if due == 0:
+            macro_error_m, end_error_m = plant_module.sense(model, q, p, 0.0)
+            estimator.correct(x, s, q[0], m.macro_position_m - macro_error_m, m.end_position_m - end_error_m)
         for k in range(periods):
             t_s = s.t_s
             plant_module.advance(model, q, p, t_s + x.actuation_delay_s, x.longest_substep_s,
@@ -54,9 +59,8 @@ def estimate(m, e, model, ahead, b, q, p):
             plant_module.advance(model, q, p, t_s + x.period_s, x.longest_substep_s,
                                  x.macro_word * x.macro_amperes_per_word,
                                  x.micro_word * x.micro_amperes_per_word, 1, 1)
-            last = k == periods - 1
             macro_error_m, end_error_m = plant_module.sense(model, q, p, x.period_s)
-            if last and fresh:
+            if k == due - 1:
                 x.macro_seen_m = m.macro_position_m - macro_error_m
                 x.end_seen_m = m.end_position_m - end_error_m
                 estimator.correct(x, s, q[0], x.macro_seen_m, x.end_seen_m)

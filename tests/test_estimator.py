@@ -97,14 +97,17 @@ def loop_of(profile, machine, law="dsmc") -> Loop:
 
 
 @pytest.mark.parametrize("gap", [1, 3, 9])
-def test_late_samples_are_predicted(oled_profile, oled_machine, gap):
-    """Lines that stay away leave the observer on its own; it needs none of them."""
+@pytest.mark.parametrize("comes", ["late", "never"])
+def test_missing_samples_are_predicted(oled_profile, oled_machine, gap, comes):
+    """Lines that stay away leave the observer on its own; one that comes late corrects it at its own instant."""
     loop = loop_of(oled_profile, oled_machine)
     rows = moves("sweep")[:1500]
     for k, setpoint in enumerate(rows):
-        loop.cycle(setpoint, fresh=k < 50 or k % 20 >= gap)
+        missing = k >= 50 and k % 20 < gap
+        loop.cycle(setpoint, fresh=not missing, silent=missing and comes == "never")
         x = loop.simulation.controller.estimator[0]
-        assert x["predicted_samples"] == (0 if k < 50 else max(0, k % 20 + 1) if k % 20 < gap else 0)
+        behind = 1 if comes == "late" else k % 20 + 1
+        assert x["predicted_samples"] == (behind if missing else 0)
         assert x["end_seen_m"] == pytest.approx(loop.true_end_m, abs=1e-12)
         assert x["macro_seen_m"] == pytest.approx(loop.true_macro_m, abs=1e-12)
     assert loop.stop == 0

@@ -257,15 +257,16 @@ def test_a_late_line_is_no_following_error(cycle):
     assert cycle.next(samples_new=1, **late) is Stop.FOLLOWING_ERROR
 
 
-def test_a_late_line_does_not_make_speed(cycle):
+def test_a_late_line_makes_its_own_speed(cycle):
+    """Its way counts over the time between its own sample and the one before, not over the cycles that passed."""
     cycle.stop()
     before = cycle.guard.copy()
     cycle.next(samples_new=0, sequence=1000, macro_position_m=5e-4)
     assert cycle.guard["macro_velocity_m_per_s"] == before["macro_velocity_m_per_s"]
-    cycle.next(samples_new=1, sequence=1001, macro_position_m=5e-4)
-    assert cycle.guard["macro_velocity_m_per_s"] == before["macro_velocity_m_per_s"]
-    cycle.next(samples_new=1, macro_position_m=6e-4)  # 0.6 mm in three cycles, a fifth of it taken
-    assert cycle.guard["macro_velocity_m_per_s"][0] == pytest.approx(0.2 * 0.6e-3 / 3e-3, rel=1e-9)
+    cycle.next(samples_new=1, sequence=1001, macro_position_m=2e-4)  # 0.2 mm in one cycle, a fifth of it taken
+    assert cycle.guard["macro_velocity_m_per_s"][0] == pytest.approx(0.2 * 0.2, rel=1e-9)
+    cycle.next(samples_new=1, macro_position_m=4e-4)  # 0.2 mm in the two cycles from sample 1001 to 1003
+    assert cycle.guard["macro_velocity_m_per_s"][0] == pytest.approx(0.04 + 0.2 * (0.1 - 0.04), rel=1e-9)
 
 
 @pytest.mark.parametrize(

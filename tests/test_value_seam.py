@@ -153,3 +153,13 @@ def test_late_lines_cost_little(oled_profile, oled_machine):
 def test_position_mode_needs_a_drive(oled_profile, oled_machine):
     with pytest.raises(RequestError, match="position"):
         simulated(with_values(oled_profile, macro__mode="position"), oled_machine, "dsmc")
+
+
+@pytest.mark.parametrize("law", ["dsmc", "pid"])
+def test_lines_that_always_come_late_still_close_the_loop(oled_profile, oled_machine, law):
+    """Every line comes a cycle late: each corrects the observer at its own instant, and the stage follows."""
+    late = np.ones(MOVE.size, np.bool_)
+    late[:20] = False
+    recording = batch.run(simulated(oled_profile, oled_machine, law), MOVE, late)
+    assert recording.commands.size == MOVE.size
+    assert np.max(np.abs(true_error_m(recording))) < 2e-6
