@@ -516,10 +516,16 @@ def test_marks(found, truth, where, right):
     assert mark["right"] is right
 
 
-def test_clopper_pearson_against_printed_values():
-    """Clopper and Pearson 1934: 10 of 10 gives 0.6915 .. 1, 8 of 10 gives 0.4439 .. 0.9748."""
-    assert score.clopper_pearson(10, 10) == pytest.approx((0.6915, 1.0), abs=1e-4)
-    assert score.clopper_pearson(8, 10) == pytest.approx((0.4439, 0.9748), abs=1e-4)
+def test_clopper_pearson_by_its_definition():
+    """At each end of the interval, the count seen or a more extreme one has a probability of 2.5 %."""
+
+    def at_least(count, p):
+        return sum(math.comb(10, k) * p**k * (1.0 - p) ** (10 - k) for k in range(count, 11))
+
+    low, high = score.clopper_pearson(8, 10)
+    assert at_least(8, low) == pytest.approx(0.025)
+    assert 1.0 - at_least(9, high) == pytest.approx(0.025)
+    assert score.clopper_pearson(10, 10) == pytest.approx((0.025**0.1, 1.0))
     assert score.clopper_pearson(0, 0) == (0.0, 1.0)
 
 

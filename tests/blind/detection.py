@@ -119,7 +119,7 @@ class Evidence:
     def _whitening(self, run):
         """(factors on the spectrum of each channel: two forces, two currents, None where absent; taper; FFT length)."""
         m = len(run.samples) - 2
-        length = fft.next_fast_len(m, real=True)
+        length = fft.next_fast_len(m, real=True) or m
         f = np.fft.rfftfreq(length, SAMPLE_S)
         f = f[f <= self.band_hz]
         difference = 4.0 * np.sin(math.pi * f * SAMPLE_S) ** 2 / SAMPLE_S**2
@@ -540,7 +540,7 @@ def judged(case, separate=True):
         evidence.set_nuisance(others, PARAMETER_ERRORS[key])
         column = evidence.parameter_column(key)
         units[key] = math.sqrt(max(evidence.inner(column, column), 0.0))
-    narrow = evidence.narrowed(SEPARATION_BAND_HZ) if separate else None
+    narrow = evidence.narrowed(SEPARATION_BAND_HZ) if separate else evidence
     del evidence
     columns = [narrow.effect_column(i) for i in range(len(case.effects))] if separate else []
     found = []

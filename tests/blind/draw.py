@@ -101,10 +101,10 @@ class Run:
     noise: np.ndarray
     current_noise: np.ndarray
     start_s: float
-    samples: np.ndarray = field(default=None)
-    cells: np.ndarray = field(default=None)
-    marks: np.ndarray = field(default=None)
-    errors: np.ndarray = field(default=None)
+    samples: np.ndarray = field(default_factory=lambda: np.zeros((0, 8)))
+    cells: np.ndarray = field(default_factory=lambda: np.zeros((0, 8)))
+    marks: np.ndarray = field(default_factory=lambda: np.zeros((0, 8)))
+    errors: np.ndarray = field(default_factory=lambda: np.zeros((0, 8)))
 
     @property
     def readings(self):

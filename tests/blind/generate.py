@@ -198,7 +198,9 @@ def write(case, folder, sealed=None, separate=True):
 
 def main(arguments=None):
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m tests.blind.generate", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.blind.generate", description=(__doc__ or "").partition("\n")[0]
+    )
     parser.add_argument(
         "--seed", type=int, required=True, help="first seed: 1..9999 to develop, 1000000.. for the final"
     )

@@ -213,7 +213,7 @@ def summary(marks, truths):
 
 def main(arguments=None):
     """Command line: prints the summary as JSON."""
-    parser = argparse.ArgumentParser(prog="python -m tests.blind.score", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.blind.score", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("findings", type=Path)
     parser.add_argument("truth", type=Path)
     given = parser.parse_args(arguments)
