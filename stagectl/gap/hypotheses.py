@@ -90,7 +90,8 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
             stiffness = getattr(joint, f"{side}_stiffness_n_per_m")
 
             def push(r: Recording, sign: float = sign, stiffness: float = stiffness) -> np.ndarray:
-                return np.where(r.side == sign, sign * stiffness * r.penetration_m, 0.0)
+                depth_m = 0.0 if r.penetration_m is None else r.penetration_m
+                return np.where(r.side == sign, sign * stiffness * depth_m, 0.0)
 
             def edge(r: Recording, sign: float = sign, stiffness: float = stiffness) -> np.ndarray:
                 return np.where(r.side == sign, -sign * stiffness, 0.0)
