@@ -104,7 +104,15 @@ RunArgument = Annotated[str, typer.Argument(help="A run: its folder, its name, o
 ProfileArgument = Annotated[str, typer.Argument(help="A name or a TOML file.", metavar="PROFILE")]
 TableArgument = Annotated[Path, typer.Argument(help="A .csv or .mat file.", metavar="TABLE")]
 
-_PROFILE, _RUNS = "oled-printer", Path("runs")
+GapRuns = Annotated[
+    list[str], typer.Argument(help="Runs to learn from: folders or names, several better than one.", metavar="RUN...")
+]
+Holdout = Annotated[
+    list[str] | None, _option("A run that no fit sees, once for each; without, each is held out once.", metavar="RUN")
+]
+GapFolder = Annotated[Path, _option("Folder of the findings.", "--out", metavar="FOLDER")]
+
+_PROFILE, _RUNS, _GAP = "oled-printer", Path("runs"), Path("gap")
 
 
 def _version(wanted: bool) -> None:
@@ -286,6 +294,25 @@ def runs_import(
 def runs_plot(run: RunArgument, out: PlotPlace = None, runs: Runs = _RUNS, json: Json = False) -> None:
     """Draw a run: tracking, hold, backlash, identification, timing."""
     _deliver("runs plot", json, lambda voice: commands.runs.plot(voice, run, runs, out))
+
+
+@app.command(
+    epilog=_epilog(
+        "stagectl gap my-stage.toml 2026-11-20T09-14-03 2026-11-20T09-31-10",
+        "stagectl gap profiles/observed/emps.toml lap --holdout pulses --out gap-emps",
+    )
+)
+def gap(
+    profile: ProfileArgument,
+    run: GapRuns,
+    holdout: Holdout = None,
+    out: GapFolder = _GAP,
+    runs: Runs = _RUNS,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Experimental: find which effect the profile lacks. Names are candidates, not yet proved on the hidden suite."""
+    _deliver("gap", json, lambda voice: commands.gap.search(voice, profile, run, holdout or [], runs, out, seed))
 
 
 _USAGE_ERROR: Any = typer.BadParameter.__base__

@@ -1,0 +1,119 @@
+"""`stagectl gap`: where a model and recordings disagree, which effect is missing, and what remains."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.markup import escape
+from rich.table import Table
+
+from stagectl.commands.answer import Answer, Voice
+from stagectl.commands.runs import folder_of
+from stagectl.errors import RequestError
+from stagectl.gap import addition, arbiter
+from stagectl.gap.believed import Believed, load_believed
+from stagectl.gap.findings_file import write_findings
+from stagectl.gap.log import Log, constant_columns, read_log
+from stagectl.gap.workflow import Findings, Named, find
+
+FINDINGS = "findings.json"
+
+
+def search(
+    voice: Voice, profile: str, training: Sequence[str], held: Sequence[str], runs_root: Path, out: Path, seed: int
+) -> Answer:
+    """Compete all effects on the recordings, judge on those held out, and write what was found."""
+    believed = load_believed(profile)
+    logs = [_log(run, runs_root, believed) for run in training]
+    apart = [_log(run, runs_root, believed) for run in held]
+    for log in [*logs, *apart]:
+        dead = constant_columns(log)
+        if dead:
+            raise RequestError(f"{log.name}: {', '.join(dead)} never changes; swapped or dead columns? Map them again")
+    findings = find(believed, logs, apart, seed=seed, say=voice.note)
+    for remark in findings.remarks:
+        voice.note(remark)
+    out.mkdir(parents=True, exist_ok=True)
+    write_findings(findings, out / FINDINGS)
+    ladder = _ladder(believed, findings, [*logs, *apart], voice)
+    data = {"findings": asdict(findings), "file": str(out / FINDINGS), "closed_loop": ladder}
+    return Answer(data, [_named(findings), *_ladder_table(ladder), *_sentences(findings, out / FINDINGS)])
+
+
+def _log(run: str, runs_root: Path, believed: Believed) -> Log:
+    return read_log(folder_of(run, runs_root), believed.period_s)
+
+
+def _named(findings: Findings) -> Table:
+    table = Table("effect", "acts on", "parameters", "gain", "held out", "as well", box=None, header_style="bold")
+    for effect in findings.named:
+        aliases = ", ".join(f"{name} on {place}" for name, place, _ in effect.aliases)
+        table.add_row(
+            effect.name,
+            effect.acts_on,
+            escape(_parameters(effect)),
+            f"{effect.gain:.0f}",
+            f"{effect.held_out_gain:.0f}",
+            escape(aliases),
+        )
+    return table
+
+
+def _parameters(effect: Named) -> str:
+    said = []
+    for name, value in effect.parameters.items():
+        sd = effect.sds.get(name)
+        said.append(f"{name} = {value:.4g}" + (f" +- {1.96 * sd:.2g}" if sd is not None else ""))
+    return "\n".join(said)
+
+
+def _sentences(findings: Findings, path: Path) -> list[str]:
+    verdicts = {
+        "nothing": "Nothing is missing that these recordings could show.",
+        "found": "Candidates: each gains on the recordings it was fitted on and on recordings that no fit saw.",
+        "unknown": "Something repeats that no effect of the library explains; its curve is in the findings.",
+    }
+    said = [verdicts[findings.verdict]]
+    said += [
+        f"Known parameter {wrong.name} is off by {wrong.error:.3g} +- {1.96 * wrong.sd:.2g}; "
+        f"the profile states {wrong.stated_sd:.2g} (one standard deviation)."
+        for wrong in findings.parameter_errors
+    ]
+    if findings.not_excited:
+        said.append(f"Not excited: {', '.join(findings.not_excited)}.")
+    return [*said, f"Findings: {path}"]
+
+
+def _ladder(believed: Believed, findings: Findings, logs: Sequence[Log], voice: Voice) -> list[dict[str, float | str]]:
+    """Simulate the closed loop with no, then all effects found, where the controller is known."""
+    rungs: list[dict[str, float | str]] = []
+    for log in logs:
+        problem = arbiter.cannot_close(believed, log)
+        if problem:
+            voice.note(problem)
+            continue
+        mass_ratio = 1.0 + findings.refitted.get("macro_mass_kg", 0.0)
+        for name, named in (("before", ()), ("after", findings.named)):
+            if name == "before":
+                effects = [dict(row) for row in believed.effects]
+            else:
+                effects = addition.effects_with(believed, findings, named, log.session)
+            gap = arbiter.gap_of(log, arbiter.simulate(believed, effects, log, mass_ratio if named else 1.0))
+            rungs.append({"run": log.name, "with": name, **asdict(gap)})
+    return rungs
+
+
+def _ladder_table(ladder: list[dict[str, float | str]]) -> list[Table]:
+    if not ladder:
+        return []
+    table = Table("closed loop", "", "force gap", "floor", "position gap", "floor", box=None, header_style="bold")
+    for rung in ladder:
+        table.add_row(
+            escape(str(rung["run"])),
+            str(rung["with"]),
+            f"{rung['command_n']:.3g} N",
+            f"{rung['command_floor_n']:.3g} N",
+            f"{float(rung['position_m']) * 1e6:.3g} um",
+            f"{float(rung['position_floor_m']) * 1e6:.3g} um",
+        )
+    return [table]

@@ -1,0 +1,299 @@
+"""The balance of forces on each body along the measured motion, and what is left of it, whitened.
+
+Forces of spring, damping and contact are taken on the measured relative position (30 nm on 13 N/mm is 0.4 mN), so the
+bodies fall apart into one mass each: `stagectl.gap.innovations` whitens them one by one. Pure.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stagectl import compose
+from stagectl.effects import CATALOGUE, Effect
+from stagectl.gap import innovations
+from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.innovations import Noise
+from stagectl.gap.log import Log
+from stagectl.gap.motion import PARTS_COUNT, Motion, delayed, lagged, motion_of
+
+AXES = ("macro", "end")
+"""Bodies; the second one is the micro's, its position the end's."""
+
+_SETTLE_S = 0.3  # the filter forgets how it began
+_LOOSE_N = 1e3
+
+
+@dataclass(slots=True)
+class Forces:
+    """What acts on the bodies on parts of intervals, and what the sensors add; None is nothing."""
+
+    macro_n: np.ndarray | None = None
+    end_n: np.ndarray | None = None
+    macro_sensor_m: np.ndarray | None = None
+    end_sensor_m: np.ndarray | None = None
+
+
+@dataclass(slots=True)
+class Recording:
+    """One log with all that does not depend on a hypothesis."""
+
+    log: Log
+    believed: Believed
+    macro: Motion
+    end: Motion | None
+    macro_command_n: np.ndarray
+    micro_command_n: np.ndarray | None
+    penetration_m: np.ndarray | None
+    penetration_velocity_m_per_s: np.ndarray | None
+    side: np.ndarray | None
+    filters: dict[str, tuple[Noise, np.ndarray, np.ndarray]]
+    judged: dict[str, np.ndarray]
+    known: dict[tuple[str, str], dict[str, np.ndarray]]  # quantities by axis and kind of place, once asked for
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Bodies that this log has."""
+        return AXES if self.end is not None else AXES[:1]
+
+    def motion(self, axis: str) -> Motion:
+        """Motion of one body."""
+        motion = self.macro if axis == "macro" else self.end
+        if motion is None:
+            raise KeyError(axis)
+        return motion
+
+    def position_m(self, axis: str) -> np.ndarray:
+        """Measured position of one body."""
+        position = self.log.macro_position_m if axis == "macro" else self.log.end_position_m
+        if position is None:
+            raise KeyError(axis)
+        return position
+
+    def belief(self, axis: str) -> BelievedAxis:
+        """What is believed of one body and its motor."""
+        if axis == "macro" or self.believed.micro is None:
+            return self.believed.macro
+        return self.believed.micro
+
+    def mass_kg(self, axis: str) -> float:
+        """Believed mass of one body with what it carries."""
+        payload_kg = self.log.macro_payload_kg if axis == "macro" else self.log.end_payload_kg
+        return self.belief(axis).mass_kg + payload_kg
+
+    def force_constant_n_per_a(self, axis: str) -> float:
+        """Believed force constant of one motor."""
+        return self.belief(axis).force_constant_n_per_a
+
+    def held_command_n(self, axis: str) -> np.ndarray:
+        """Commanded force as the drive holds it, before its current loop, shape (n, parts)."""
+        command_n = self.log.macro_command_n if axis == "macro" else self.log.micro_command_n
+        if command_n is None:
+            return np.zeros_like(self.macro.position_m)
+        return delayed(command_n, self.belief(axis).latch_s / self.log.period_s)
+
+
+def recording_of(log: Log, believed: Believed) -> Recording:
+    """Prepare a log: motion, commands on parts of intervals, contact geometry."""
+    h = log.period_s
+    macro = motion_of(log.macro_position_m, h, believed.macro.noise_m)
+    macro_n = lagged(delayed(log.macro_command_n, believed.macro.latch_s / h), believed.macro.current_loop_s, h)
+    end = micro_n = depth = depth_rate = side = None
+    if log.end_position_m is not None and log.micro_command_n is not None and believed.micro is not None:
+        end = motion_of(log.end_position_m, h, believed.micro.noise_m)
+        micro_n = lagged(delayed(log.micro_command_n, believed.micro.latch_s / h), believed.micro.current_loop_s, h)
+        joint = believed.joint
+        if joint is not None:
+            x_b = macro.position_m - end.position_m
+            rate = macro.velocity_m_per_s - end.velocity_m_per_s
+            side = np.where(x_b > joint.right_m, 1.0, np.where(x_b < -joint.left_m, -1.0, 0.0))
+            depth = np.where(side > 0.0, x_b - joint.right_m, np.where(side < 0.0, -joint.left_m - x_b, 0.0))
+            depth_rate = side * rate
+    return Recording(log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {})
+
+
+def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = True) -> None:
+    """Build the whitening filters; samples at which a sign of velocity can't be trusted are let loose."""
+    log = recording.log
+    for axis in recording.axes:
+        level = noise[axis]
+        motion = recording.motion(axis)
+        loose = motion.slow if mask_slow else np.zeros(log.samples_count, bool)
+        gain, variance = innovations.gains(
+            log.valid, loose, recording.mass_kg(axis), log.period_s, level.sensor_m, level.force_n,
+            level.corner_rad_per_s, level.white_force_n, _LOOSE_N,
+        )  # fmt: skip
+        recording.filters[axis] = (level, gain, variance)
+        judged = log.valid & ~np.concatenate([[False], loose[:-1]])
+        judged[: round(_SETTLE_S / log.period_s)] = False
+        recording.judged[axis] = judged
+
+
+def whitened(recording: Recording, axis: str, force_n: np.ndarray | None, position_m: np.ndarray | None) -> np.ndarray:
+    """Return innovations of one body under forces and from positions, at judged samples, shape (m,)."""
+    log = recording.log
+    level, gain, variance = recording.filters[axis]
+    n = log.samples_count
+    if force_n is None:
+        mean_n = early_n = np.zeros(n)
+    else:
+        mean_n, early_n = innovations.moments(force_n)
+    x = np.zeros(n) if position_m is None else position_m
+    start_m = float(x[0]) if position_m is not None else 0.0
+    out = innovations.innovations(
+        x, mean_n, early_n, gain, variance, recording.mass_kg(axis), log.period_s, level.corner_rad_per_s, start_m
+    )
+    return out[recording.judged[axis]]
+
+
+def column(recording: Recording, forces: Forces) -> np.ndarray:
+    """Return what forces and sensor errors that the filter knows nothing of add to the innovations of all bodies."""
+    parts = []
+    for axis, force_n, sensor_m in (
+        ("macro", forces.macro_n, forces.macro_sensor_m),
+        ("end", forces.end_n, forces.end_sensor_m),
+    ):
+        if axis in recording.axes:
+            if force_n is None and sensor_m is None:
+                parts.append(np.zeros(int(recording.judged[axis].sum())))
+            else:
+                parts.append(whitened(recording, axis, None if force_n is None else -force_n, sensor_m))
+    return np.concatenate(parts)
+
+
+def known_forces(recording: Recording) -> Forces:
+    """Sum what is believed to act: motors, joint, effects of the profile."""
+    macro_n = recording.macro_command_n.copy()
+    end_n = None if recording.micro_command_n is None else recording.micro_command_n.copy()
+    joint = recording.believed.joint
+    if end_n is not None and joint is not None:
+        joint_n = joint_force_n(recording)
+        macro_n -= joint_n
+        end_n += joint_n
+    total = Forces(macro_n, end_n)
+    for row in recording.believed.effects:
+        effect = CATALOGUE[row["name"]]
+        add(total, effect_forces(recording, effect, row["acts_on"], [row[name] for name in effect.parameters]))
+    return total
+
+
+def joint_force_n(recording: Recording) -> np.ndarray:
+    """Force of spring, damping and contact on the end, shape (n, parts)."""
+    joint, end = recording.believed.joint, recording.end
+    if joint is None or end is None or recording.side is None or recording.penetration_m is None:
+        raise KeyError("joint")
+    relative_m = end.position_m - recording.macro.position_m
+    rate = end.velocity_m_per_s - recording.macro.velocity_m_per_s
+    stiffness = np.where(recording.side > 0.0, joint.right_stiffness_n_per_m, joint.left_stiffness_n_per_m)
+    contact_n = recording.side * stiffness * recording.penetration_m
+    return contact_n - joint.spring_n_per_m * relative_m - joint.damping_n_s_per_m * rate
+
+
+def add(total: Forces, more: Forces) -> None:
+    """Add forces to forces, in place."""
+    for name in ("macro_n", "end_n", "macro_sensor_m", "end_sensor_m"):
+        extra = getattr(more, name)
+        if extra is not None:
+            held = getattr(total, name)
+            setattr(total, name, extra if held is None else held + extra)
+
+
+def quantities(recording: Recording, axis: str, place: str) -> dict[str, np.ndarray]:
+    """Everything that a law at one place may ask for, on parts of intervals."""
+    kind = "joint" if place == "joint" else "sensor" if place.endswith("_sensor") else "force"
+    key = (axis, kind)
+    if key not in recording.known:
+        recording.known[key] = _quantities(recording, axis, kind)
+    return recording.known[key]
+
+
+def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndarray]:
+    motion = recording.motion(axis)
+    h = recording.log.period_s
+    whole = np.ones_like(motion.position_m)
+    relative = recording.end if recording.end is not None else recording.macro
+    relative_m = relative.position_m - recording.macro.position_m
+    relative_m_per_s = relative.velocity_m_per_s - recording.macro.velocity_m_per_s
+    motor_n = recording.macro_command_n if axis == "macro" else recording.micro_command_n
+    motor_n = 0.0 * whole if motor_n is None else motor_n
+    known = {
+        "position_m": relative_m if kind == "joint" else motion.position_m,
+        "velocity_m_per_s": relative_m_per_s if kind == "joint" else motion.velocity_m_per_s,
+        "acceleration_m_per_s2": motion.acceleration_m_per_s2,
+        "relative_position_m": relative_m,
+        "relative_velocity_m_per_s": relative_m_per_s,
+        "motor_force_n": motor_n,
+        "current_a": motor_n / recording.force_constant_n_per_a(axis),
+        "command_a": recording.held_command_n(axis) / recording.force_constant_n_per_a(axis),
+        "micro_motor_force_n": 0.0 * whole if recording.micro_command_n is None else recording.micro_command_n,
+        "mass_kg": recording.mass_kg(axis) * whole,
+        "t_s": recording.log.times_s[:, None] + (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * h,
+        "dt_s": h / PARTS_COUNT * whole,
+    }
+    if kind == "sensor":  # a reading is of the sample's instant, which begins its interval
+        position_m = recording.position_m(axis)[:, None] * whole
+        velocity = np.gradient(motion.position_m.mean(axis=1), h)
+        known |= {"position_m": position_m, "velocity_m_per_s": _at_samples(motion.velocity_m_per_s, velocity)}
+    joint = recording.believed.joint
+    if joint is not None and recording.side is not None:
+        known["penetration_m"] = recording.penetration_m
+        known["penetration_velocity_m_per_s"] = recording.penetration_velocity_m_per_s
+        known["contact_side_ratio"] = recording.side
+        known["contact_stiffness_n_per_m"] = np.where(
+            recording.side > 0.0, joint.right_stiffness_n_per_m, joint.left_stiffness_n_per_m
+        )
+    return known
+
+
+def _at_samples(fine: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+    """Bring values at middles of parts back to the instants that begin the intervals."""
+    flat = fine.ravel()
+    parts = fine.shape[1]
+    starts = np.empty(fine.shape[0])
+    starts[1:] = 0.5 * (flat[parts::parts] + flat[parts - 1 : -1 : parts])
+    starts[0] = flat[0] if np.isfinite(flat[0]) else fallback[0]
+    return starts[:, None] * np.ones((1, parts))
+
+
+def effect_forces(recording: Recording, effect: Effect, place: str, parameters: list[float]) -> Forces:
+    """Evaluate one effect along the measured motion, and put it where it acts."""
+    axis = "macro" if place.startswith("macro") else "end"
+    known = quantities(recording, axis, place)
+    value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
+    if place in ("contact", "contact_edge", "joint"):
+        if place == "joint":
+            push_n = value
+        elif recording.side is None:
+            push_n = np.zeros_like(value)
+        else:
+            push_n = recording.side * value
+            if place == "contact_edge":  # an edge further out is a joint that overlaps less
+                push_n = -push_n * known["contact_stiffness_n_per_m"]
+        return Forces(macro_n=-push_n, end_n=push_n)
+    if place.endswith("_sensor"):
+        return _misread(recording, axis, value)
+    if place.endswith("_command"):
+        belief = recording.belief(axis)
+        value = lagged(value * belief.force_constant_n_per_a, belief.current_loop_s, recording.log.period_s)
+    return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
+
+
+def _misread(recording: Recording, axis: str, error_m: np.ndarray) -> Forces:
+    """Return what a sensor error does: to the position, and to the joint's forces that were taken at a wrong place."""
+    sampled_m = np.ascontiguousarray(error_m[:, 0])
+    joint = recording.believed.joint
+    forces = Forces(macro_sensor_m=sampled_m) if axis == "macro" else Forces(end_sensor_m=sampled_m)
+    if joint is not None and recording.side is not None:
+        left = np.where(recording.side < 0.0, joint.left_stiffness_n_per_m, 0.0)
+        right = np.where(recording.side > 0.0, joint.right_stiffness_n_per_m, 0.0)
+        stiffness = joint.spring_n_per_m + left + right
+        forces.end_n = stiffness * error_m * (1.0 if axis == "end" else -1.0)
+        forces.macro_n = -forces.end_n
+    return forces
+
+
+def along_motion(effect: Effect, arguments: list[np.ndarray], parameters: list[float]) -> np.ndarray:
+    """Run a law in time order over arrays of its quantities, all of shape (n, parts); shape kept."""
+    columns = np.column_stack([np.ascontiguousarray(values).ravel() for values in arguments])
+    memory = np.zeros(max(effect.memory, 1))
+    out = compose.along(effect)(columns, np.array([*parameters, 0.0]), memory)
+    return np.asarray(out).reshape(arguments[0].shape)

@@ -1,0 +1,47 @@
+"""Shapes that are searched: pitches, Stribeck speeds, exponents, corners; in the range that the recordings can show.
+
+Pure.
+"""
+
+import numpy as np
+
+from stagectl.gap.balance import Recording
+
+_SMOOTHING_M_PER_S = 1e-4
+_LASER_M = 632.8e-9
+
+Grid = dict[str, list[dict[str, float]]]
+
+
+def grids_for(recordings: list[Recording]) -> Grid:
+    """Return, by effect, the shapes to try on these recordings."""
+    centre_m = float(np.mean([0.5 * (r.log.macro_position_m.max() + r.log.macro_position_m.min()) for r in recordings]))
+    smooth = {"smoothing_m_per_s": _SMOOTHING_M_PER_S}
+    return {
+        "coulomb_friction": [smooth],
+        "asymmetric_coulomb_friction": [smooth],
+        "stribeck_friction": [smooth | {"stribeck_m_per_s": v} for v in (1e-3, 3e-3, 1e-2, 3e-2, 6e-2)],
+        "sublinear_viscous_friction": [{"exponent_ratio": p} for p in (0.5, 0.65, 0.8)],
+        "load_dependent_friction": [smooth],
+        "position_dependent_friction": [smooth],
+        "dahl_friction": [{"slip_m": s} for s in (1e-6, 5e-6, 2e-5, 1e-4)],
+        "lugre_friction": [
+            {"static_ratio": 1.5, "stribeck_m_per_s": v, "slip_m": s} for v in (3e-3, 1e-2) for s in (2e-6, 1e-5)
+        ],
+        "cable_hysteresis": [{"slip_m": s} for s in (1e-3, 1e-2, 5e-2)],
+        "cable_spring": [{"anchor_m": centre_m}],
+        "contact_hysteresis": [{"smoothing_m_per_s": _SMOOTHING_M_PER_S}],
+        "soft_contact": [{"knee_m": k} for k in (3e-6, 6e-6, 1e-5, 2e-5)],
+        "force_constant_saturation": [{"saturation_n": s} for s in (500.0, 2000.0, 8000.0)],
+        "amplifier_dead_band": [{"half_width_a": w} for w in (1e-3, 3e-3, 1e-2, 3e-2)],
+        "current_loop_lag": [{"time_constant_s": 1e-4}],
+        "command_delay": [{"delay_s": 1e-4}],
+        "flexible_mode": [
+            {"share_ratio": 0.02, "frequency_hz": float(f), "damping_ratio": 0.02} for f in np.geomspace(8.0, 200.0, 14)
+        ],
+        "sensor_delay": [{"delay_s": 1e-5}],
+        "sensor_lag": [{"time_constant_s": 1e-4}],
+        "cyclic_error": [{"wavelength_m": _LASER_M}],
+        "thermal_drift": [{"time_constant_s": t} for t in (5.0, 30.0, 300.0)],
+        "abbe_error": [{"centre_m": centre_m}],
+    }

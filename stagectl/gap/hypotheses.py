@@ -1,0 +1,287 @@
+"""Everything that could be missing: effects at grids of their shape parameters, errors of known parameters, curves.
+
+Each is a group of whitened columns whose amplitudes are solved for; shapes (a pitch, a Stribeck speed) are searched.
+Pure.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from stagectl.effects import CATALOGUE, Effect
+from stagectl.gap import balance
+from stagectl.gap.balance import Forces, Recording
+from stagectl.gap.motion import delayed, lagged
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One hypothesis: the columns of one effect with its shape fixed."""
+
+    name: str
+    acts_on: str
+    shape: dict[str, float]
+    amplitudes: tuple[str, ...]
+    forces: Callable[[Recording], list[Forces]]
+    scope: str = "structural"
+    bounds: tuple[tuple[float, float], ...] = ()
+    linear: bool = True
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """What it is called and where it acts."""
+        return self.name, self.acts_on
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        shape = ", ".join(f"{name} = {value:.4g}" for name, value in self.shape.items())
+        return f"{self.name} on {self.acts_on}" + (f" ({shape})" if shape else "")
+
+
+AS_PARAMETERS = frozenset(
+    {
+        "mass_error",
+        "force_constant_error",
+        "contact_stiffness_error",
+        "backlash_width_change",
+        "backlash_centre_shift",
+    }
+)
+"""Effects that say the same as a known parameter that is wrong: `parameter_terms` has them."""
+
+
+def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
+    """Errors of what is believed, as terms with the standard deviation of their amplitude (a ratio, or metres)."""
+    believed = recording.believed
+    joint = believed.joint
+    found: list[tuple[Term, float]] = []
+
+    def known(name: str, sd: float, forces: Callable[[Recording], Forces]) -> None:
+        found.append((Term(name, "parameter", {}, ("error_ratio",), lambda r: [forces(r)]), sd))
+
+    # a = f / m: a mass that is wrong by a ratio scales what is known to act. Taken as m times the measured acceleration
+    # it would, together with the force constant, shrink every rest that nobody explains: a fit that collapses.
+    def inertia(axis: str) -> Callable[[Recording], Forces]:
+        def of(r: Recording) -> Forces:
+            known = balance.known_forces(r)
+            if axis == "macro":
+                return Forces(macro_n=None if known.macro_n is None else -known.macro_n)
+            return Forces(end_n=None if known.end_n is None else -known.end_n)
+
+        return of
+
+    known("macro_mass_kg", believed.macro.mass_sd_kg / believed.macro.mass_kg, inertia("macro"))
+    known("macro_force_constant", believed.macro.force_constant_sd_ratio, lambda r: Forces(macro_n=r.macro_command_n))
+    if believed.micro is not None and recording.end is not None:
+        known("micro_mass_kg", believed.micro.mass_sd_kg / believed.micro.mass_kg, inertia("end"))
+        reaction = sum(row["fraction_ratio"] for row in believed.effects if row["name"] == "micro_reaction")
+
+        def micro_motor(r: Recording) -> Forces:
+            force_n = r.micro_command_n
+            return Forces(macro_n=None if force_n is None or not reaction else -reaction * force_n, end_n=force_n)
+
+        known("micro_force_constant", believed.micro.force_constant_sd_ratio, micro_motor)
+    if joint is not None and recording.end is not None:
+        known("spring_n_per_m", joint.stiffness_sd_ratio, _joint(lambda r: -joint.spring_n_per_m * _relative_m(r)))
+        known("damping_n_s_per_m", joint.damping_sd_ratio, _joint(lambda r: -joint.damping_n_s_per_m * _rate(r)))
+        for side, sign in (("left", -1.0), ("right", 1.0)):
+            stiffness = getattr(joint, f"{side}_stiffness_n_per_m")
+
+            def push(r: Recording, sign: float = sign, stiffness: float = stiffness) -> np.ndarray:
+                depth_m = 0.0 if r.penetration_m is None else r.penetration_m
+                return np.where(r.side == sign, sign * stiffness * depth_m, 0.0)
+
+            def edge(r: Recording, sign: float = sign, stiffness: float = stiffness) -> np.ndarray:
+                return np.where(r.side == sign, -sign * stiffness, 0.0)
+
+            known(f"{side}_stiffness_n_per_m", getattr(joint, f"{side}_stiffness_sd_ratio"), _joint(push))
+            found.append((Term(f"{side}_m", "parameter", {}, ("error_m",), _as_list(_joint(edge))), joint.width_sd_m))
+    for axis, side in (("macro", "macro"), ("end", "micro")):
+        if axis in recording.axes:
+            belief = recording.belief(axis)
+            found.append((_timing(f"{side}_latch_s", axis, 0.0), belief.latch_sd_s))
+            if belief.current_loop_s > 0.0:
+                found.append((_timing(f"{side}_current_loop_s", axis, belief.current_loop_s), belief.current_loop_sd_s))
+    for row in believed.effects:
+        effect = CATALOGUE[row["name"]]
+        values = [row[name] for name in effect.parameters]
+
+        def existing(
+            r: Recording, effect: Effect = effect, place: str = row["acts_on"], values: list[float] = values
+        ) -> Forces:
+            return balance.effect_forces(r, effect, place, values)
+
+        name = f"{row['name']} on {row['acts_on']}"
+        known(name, believed.effect_sd_ratios.get(name, believed.effect_sd_ratio), existing)
+    return found
+
+
+_TIMING_STEP_S = 5e-6
+
+
+def _timing(name: str, axis: str, lag_s: float) -> Term:
+    """Return the error of a delay (`lag_s` = 0) or of a lag, in seconds, by a difference over a small step."""
+
+    def forces(r: Recording) -> list[Forces]:
+        h, belief = r.log.period_s, r.belief(axis)
+        command_n = r.log.macro_command_n if axis == "macro" else r.log.micro_command_n
+        if command_n is None:
+            return [Forces()]
+        step_s = _TIMING_STEP_S
+        now = lagged(delayed(command_n, belief.latch_s / h), belief.current_loop_s, h)
+        if lag_s:
+            later = lagged(delayed(command_n, belief.latch_s / h), belief.current_loop_s + step_s, h)
+        else:
+            later = lagged(delayed(command_n, (belief.latch_s + step_s) / h), belief.current_loop_s, h)
+        slope = (later - now) / step_s
+        if axis == "macro":
+            return [Forces(macro_n=slope)]
+        reaction = sum(row["fraction_ratio"] for row in r.believed.effects if row["name"] == "micro_reaction")
+        return [Forces(macro_n=-reaction * slope if reaction else None, end_n=slope)]
+
+    return Term(name, "parameter", {}, ("error_s",), forces)
+
+
+def _as_list(forces: Callable[[Recording], Forces]) -> Callable[[Recording], list[Forces]]:
+    return lambda r: [forces(r)]
+
+
+def _joint(force_on_end: Callable[[Recording], np.ndarray]) -> Callable[[Recording], Forces]:
+    def of(r: Recording) -> Forces:
+        force_n = force_on_end(r)
+        return Forces(macro_n=-force_n, end_n=force_n)
+
+    return of
+
+
+def _relative_m(r: Recording) -> np.ndarray:
+    if r.end is None:
+        raise KeyError("end")
+    return r.end.position_m - r.macro.position_m
+
+
+def _rate(r: Recording) -> np.ndarray:
+    if r.end is None:
+        raise KeyError("end")
+    return r.end.velocity_m_per_s - r.macro.velocity_m_per_s
+
+
+def effect_terms(recordings: list[Recording], grids: dict[str, list[dict[str, float]]]) -> Iterator[Term]:
+    """Yield every effect of the catalogue at every place and shape of its grid."""
+    has_micro = all(r.end is not None for r in recordings)
+    present = {(row["name"], row["acts_on"]) for row in recordings[0].believed.effects}
+    for effect in CATALOGUE.values():
+        if "pitch_m" in effect.parameters or effect.name == "base_vibration":
+            continue  # searched by what stands out: `periodic_terms`
+        if effect.name in AS_PARAMETERS:
+            continue
+        for place in effect.places:
+            if not has_micro and (not place.startswith("macro") or _needs_micro(effect)):
+                continue
+            if place.startswith("contact") and recordings[0].side is None:
+                continue
+            if (effect.name, place) in present:
+                continue
+            for shape in grids.get(effect.name, [{}]):
+                yield term_of(effect, place, shape)
+
+
+def periodic_terms(
+    recordings: list[Recording], axis: str, pitches_m: list[float], frequencies_hz: list[float]
+) -> Iterator[Term]:
+    """Yield the effects that have a pitch or a frequency, at those that stand out."""
+    force = "macro_force" if axis == "macro" else "micro_force"
+    for effect in CATALOGUE.values():
+        for place in effect.places:
+            if not place.startswith(force.removesuffix("_force")):
+                continue
+            if "pitch_m" in effect.parameters and "second_n" not in effect.parameters:
+                yield from (term_of(effect, place, {"pitch_m": pitch}) for pitch in pitches_m)
+            elif effect.name == "base_vibration":
+                yield from (term_of(effect, place, {"frequency_hz": f}) for f in frequencies_hz)
+
+
+def _needs_micro(effect: Effect) -> bool:
+    return any(name.startswith(("micro_", "relative_", "penetration", "contact_")) for name in effect.quantities)
+
+
+def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
+    """Make the term of one effect with its shape fixed.
+
+    Parameters that the output is linear in become columns, an amplitude with a phase a pair of them. An effect that is
+    linear in nothing (a delay, a knee) is one column at its shape; its amplitude should come out as one.
+    """
+    linear = [name for name in effect.linear if name not in shape]
+    settings: list[dict[str, float]] = []
+    amplitudes: list[str] = []
+    for name in linear:
+        phase = phase_of(effect, name)
+        for angle in (0.0, 0.5 * np.pi) if phase else (None,):
+            others = {p: 0.0 for p in effect.parameters if p.endswith("phase_rad")}
+            values = others | dict.fromkeys(linear, 0.0) | {name: 1.0} | shape
+            if phase and angle is not None:
+                values[phase] = angle
+            settings.append(values)
+            amplitudes.append(f"{name}*" if phase else name)
+    if not linear:
+        settings, amplitudes = [dict(shape)], ["share_of_shape_ratio"]
+
+    def forces(r: Recording) -> list[Forces]:
+        return [
+            balance.effect_forces(r, effect, place, [values[name] for name in effect.parameters]) for values in settings
+        ]
+
+    scope = "structural"
+    for tag in ("session", "run"):
+        if tag in effect.tags.values():
+            scope = tag
+    bounds = (
+        tuple((-high, high) for high in (effect.bounds[name.removesuffix("*")][1] for name in amplitudes))
+        if any(name.endswith("*") for name in amplitudes)
+        else tuple(effect.bounds[name] for name in linear) or (_share_bounds(effect, shape),)
+    )
+    return Term(effect.name, place, dict(shape), tuple(amplitudes), forces, scope, bounds, bool(linear))
+
+
+def _share_bounds(effect: Effect, shape: dict[str, float]) -> tuple[float, float]:
+    """Return what the amplitude of an effect that is linear in nothing may be: its parameter's range over its shape."""
+    name = effect.parameters[0]
+    low, high = effect.bounds[name]
+    return (0.0 if low > 0.0 else low / shape[name]), high / shape[name]
+
+
+def phase_of(effect: Effect, amplitude: str) -> str | None:
+    """Return the parameter that is the phase of an amplitude."""
+    for name in (f"{amplitude.split('_')[0]}_phase_rad", "phase_rad"):
+        if name in effect.parameters:
+            return name
+    return None
+
+
+_KNOTS_COUNT = 12
+_CURVES = ("position_m", "velocity_m_per_s", "t_s")  # not acceleration: its line is a mass, and shrinks any rest
+
+
+def curve_terms(recordings: list[Recording]) -> Iterator[Term]:
+    """Yield tables over one quantity of each body: what stands for an effect that no library has."""
+    axes = recordings[0].axes
+    for axis in axes:
+        for quantity in (*_CURVES, *(("relative_position_m",) if len(axes) > 1 else ())):
+            spans = [balance.quantities(r, axis, "macro_force")[quantity] for r in recordings]
+            low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
+            if not high > low:
+                continue
+            knots = np.linspace(low, high, _KNOTS_COUNT)
+
+            def forces(
+                r: Recording, axis: str = axis, quantity: str = quantity, knots: np.ndarray = knots
+            ) -> list[Forces]:
+                value = balance.quantities(r, axis, "macro_force")[quantity]
+                hats = [np.interp(value, knots, np.eye(_KNOTS_COUNT)[k]) for k in range(_KNOTS_COUNT)]
+                return [Forces(macro_n=hat) if axis == "macro" else Forces(end_n=hat) for hat in hats]
+
+            place = "macro_force" if axis == "macro" else "micro_force"
+            names = tuple(f"{knot:.6g}" for knot in knots)
+            yield Term(f"curve over {quantity}", place, {}, names, forces)

@@ -1,0 +1,94 @@
+"""Whitening: what a mass on known forces is off from its measured position, as independent numbers of unit variance.
+
+    m x'' = f + d,    d' = -w d + noise,    y = x + n
+
+A Kalman filter of (x, v, d) predicts each sample from the ones before; d stands for the slow force that nobody
+models, n for the sensor. With recorded commands as input, whatever controller ran, the innovations hold all that the
+positions say of the forces (prediction-error method, Ljung 1999, 7). The filter is linear: the innovations of
+f0 + a f1 are those of f0 plus a times those of f1 alone, which makes every effect a column of a regression.
+
+Forces come as two numbers a sample interval: their mean, and their mean weighted towards the interval's beginning,
+(2 / h^2) integral of (h - s) f(s) ds, which is what moves the position. Pure; knows no clock.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stagectl.compiled import compiled
+
+_START_SD = (1e-6, 1e-2)  # of position and velocity before the first sample, m and m/s
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What the filter believes of an axis: sensor, and the force that nobody models (Gauss-Markov)."""
+
+    sensor_m: float
+    force_n: float
+    corner_rad_per_s: float
+    white_force_n: float  # besides, independent from sample to sample
+
+
+@compiled
+def gains(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, white_force_n, loose_force_n):
+    """Return (gains (n, 3), innovation variances (n,)); `loose` intervals feel an unknown force of `loose_force_n`."""
+    n = valid.size
+    gain = np.zeros((n, 3))
+    variance = np.zeros(n)
+    h = period_s
+    decay = np.exp(-corner_rad_per_s * h)
+    drive = force_n * force_n * (1.0 - decay * decay)
+    a = np.array([[1.0, h, 0.5 * h * h / mass_kg], [0.0, 1.0, h / mass_kg], [0.0, 0.0, decay]])
+    p = np.zeros((3, 3))
+    p[0, 0] = _START_SD[0] ** 2 + sensor_m * sensor_m
+    p[1, 1] = _START_SD[1] ** 2
+    p[2, 2] = force_n * force_n
+    for k in range(n):
+        variance[k] = p[0, 0] + sensor_m * sensor_m
+        if valid[k]:
+            for i in range(3):
+                gain[k, i] = p[i, 0] / variance[k]
+            row = p[0].copy()
+            for i in range(3):
+                for j in range(3):
+                    p[i, j] -= gain[k, i] * row[j]
+        p = a @ p @ a.T
+        p[2, 2] += drive
+        white = white_force_n + (loose_force_n if loose[k] else 0.0)
+        q = (white / mass_kg) ** 2
+        p[0, 0] += 0.25 * q * h**4
+        p[0, 1] += 0.5 * q * h**3
+        p[1, 0] = p[0, 1]
+        p[1, 1] += q * h * h
+    return gain, variance
+
+
+@compiled
+def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, corner_rad_per_s, start_m):
+    """Return the whitened innovations of positions under forces (mean and early-weighted mean an interval), (n,)."""
+    n = position_m.size
+    out = np.zeros(n)
+    h = period_s
+    x = start_m
+    v = 0.0
+    d = 0.0
+    decay = np.exp(-corner_rad_per_s * h)
+    for k in range(n):
+        z = position_m[k] - x
+        if gain[k, 0] != 0.0:
+            out[k] = z / np.sqrt(variance[k])
+        x += gain[k, 0] * z
+        v += gain[k, 1] * z
+        d += gain[k, 2] * z
+        x += v * h + 0.5 * h * h * (early_n[k] + d) / mass_kg
+        v += h * (mean_n[k] + d) / mass_kg
+        d *= decay
+    return out
+
+
+def moments(fine_n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (mean, early-weighted mean) of forces on equal parts of each interval, shape (n, parts)."""
+    parts = fine_n.shape[1]
+    middles = (np.arange(parts) + 0.5) / parts
+    return fine_n.mean(axis=1), fine_n @ (2.0 * (1.0 - middles)) / parts

@@ -1,0 +1,81 @@
+"""Where to look for what repeats: pitches in position and frequencies in time, from what every other hypothesis leaves.
+
+The gain of a force on whitened innovations is a scalar product; its adjoint turns the innovations into one signal of
+force, whose spectrum over position or time shows every period at once. Pure.
+"""
+
+import numpy as np
+
+from stagectl.gap import innovations
+from stagectl.gap.balance import Recording
+
+PEAKS_COUNT = 4
+_CELLS_PER_PITCH = 6.0
+_LEAST_PITCH_M = 4e-4
+_LOWEST_HZ = 2.5
+_HIGHEST_HZ = 120.0
+_NEIGHBOURS = 41
+
+
+def force_signal(recording: Recording, axis: str, rest: np.ndarray) -> np.ndarray:
+    """Return the adjoint of the whitening on `rest` (innovations at judged samples), one element a sample."""
+    level, gain, variance = recording.filters[axis]
+    whole = np.zeros(recording.log.samples_count)
+    whole[recording.judged[axis]] = rest
+    backwards = np.ascontiguousarray(whole[::-1])
+    n = backwards.size
+    settled = np.repeat(gain[n // 2 : n // 2 + 1], n, axis=0)
+    out = innovations.innovations(
+        np.zeros(n), backwards, backwards, settled, np.full(n, variance[n // 2]), recording.mass_kg(axis),
+        recording.log.period_s, level.corner_rad_per_s, 0.0,
+    )  # fmt: skip
+    return -out[::-1]
+
+
+def pitches_m(recordings: list[Recording], axis: str, signals: list[np.ndarray]) -> list[float]:
+    """Return the pitches with the highest peaks over position, several recordings together, m."""
+    span_m = max(float(np.ptp(r.position_m(axis))) for r in recordings)
+    if not span_m > 4.0 * _LEAST_PITCH_M:
+        return []
+    cell_m = _LEAST_PITCH_M / _CELLS_PER_PITCH
+    count = int(2 ** np.ceil(np.log2(2.0 * span_m / cell_m)))
+    power = np.zeros(count // 2 + 1)
+    for recording, signal in zip(recordings, signals, strict=True):
+        position_m = recording.motion(axis).position_m[:, 0]
+        moving = ~recording.motion(axis).slow
+        cell = np.floor((position_m - position_m.min()) / cell_m).astype(int)
+        sums = np.bincount(cell[moving], signal[moving], minlength=count)[:count]
+        power += np.abs(np.fft.rfft(sums)) ** 2
+    return [1.0 / f for f in _peaks(power, 1.0 / (count * cell_m), 2.0 / span_m, 1.0 / _LEAST_PITCH_M)]
+
+
+def frequencies_hz(recordings: list[Recording], axis: str, signals: list[np.ndarray]) -> list[float]:
+    """Return the frequencies with the highest peaks over time, Hz."""
+    period_s = recordings[0].log.period_s
+    count = int(2 ** np.ceil(np.log2(2 * max(s.size for s in signals))))
+    power = np.zeros(count // 2 + 1)
+    for signal in signals:
+        power += np.abs(np.fft.rfft(signal, count)) ** 2
+    return _peaks(power, 1.0 / (count * period_s), _LOWEST_HZ, _HIGHEST_HZ)
+
+
+def _peaks(power: np.ndarray, step: float, low: float, high: float) -> list[float]:
+    """Return the places of the highest peaks above their neighbourhood's median, in units of `step`."""
+    first, last = max(int(np.ceil(low / step)), 2), min(int(high / step), power.size - 2)
+    if last - first < _NEIGHBOURS:
+        return []
+    part = power[first:last]
+    padded = np.pad(part, _NEIGHBOURS // 2, mode="reflect")
+    middle = np.median(np.lib.stride_tricks.sliding_window_view(padded, _NEIGHBOURS), axis=1)
+    height = part / np.maximum(middle, 1e-300)
+    found: list[float] = []
+    for k in np.argsort(-height):
+        here = first + int(k)
+        if all(abs(here - f / step) > 3.0 for f in found):
+            a, b, c = power[here - 1], power[here], power[here + 1]
+            curve = a - 2.0 * b + c
+            shift = 0.5 * (a - c) / curve if curve < 0.0 else 0.0
+            found.append((here + float(np.clip(shift, -0.5, 0.5))) * step)
+        if len(found) == PEAKS_COUNT:
+            break
+    return found

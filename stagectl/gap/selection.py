@@ -1,0 +1,419 @@
+"""Which hypotheses stay: generalised least squares on whitened columns, thresholds from the workflow's own null.
+
+Everything is algebra on one Gram matrix a recording, so hundreds of hypotheses and hundreds of nulls cost seconds. A
+term stays when it gains on the recordings it was fitted on AND on recordings that no fit saw, each beyond what the
+best of the whole library gains on noise, and when it explains a share of what is reducible at all. Pure.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+NULL_QUANTILE = 0.99
+MATERIAL_RATIO = 0.03
+"""Share of the reducible part (beyond the floor) that a term must explain, on either side."""
+
+ALIAS_GAIN = 9.0
+"""Log-likelihood ratio (twice) below which two names can't be told apart: power 0.9 needs about this."""
+
+_ALIAS_SHARE = 0.03
+_JITTER = 1e-10
+_BOUND_SDS = 2.0
+_AGREE_SDS = 4.0
+_AGREE_RATIO = 0.35
+
+
+@dataclass(frozen=True, slots=True)
+class Sums:
+    """One recording: Gram matrix of [innovations, columns...] in units of the noise, and how many numbers it sums."""
+
+    gram: np.ndarray
+    count: float
+    session: str
+    run: str
+    nulls: np.ndarray  # what the columns make of white noise in the innovations' place, shape (draws, columns)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Columns that stay or go together; `prior_sds` says how far each amplitude may be from zero, inf = any."""
+
+    key: object
+    columns: tuple[int, ...]
+    scope: str = "structural"  # structural | session | run: how far its amplitudes reach
+    prior_sds: tuple[float, ...] = ()
+    bounds: tuple[tuple[float, float], ...] = ()  # of each amplitude; a friction that drives is no friction
+    searched: int = 0  # shape parameters that a grid or a spectrum chose
+
+    @property
+    def complexity(self) -> int:
+        """Numbers that it takes from the data."""
+        return len(self.columns) + self.searched
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Amplitudes of some groups on some recordings, and what they gain over none at all."""
+
+    groups: tuple[Group, ...]
+    slots: tuple[tuple[int, str], ...]  # (column, "" or the session or run that it is of)
+    values: np.ndarray
+    covariance: np.ndarray
+    gain: float
+
+    def of(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
+        """Return values and standard deviations of one group, sessions one after the other."""
+        places = [k for k, (column, _) in enumerate(self.slots) if column in group.columns]
+        return self.values[places], np.sqrt(np.maximum(np.diag(self.covariance)[places], 0.0))
+
+
+def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
+    """Solve the amplitudes of `groups` on all of `sums`."""
+    slots, precision = _slots_of(groups, sums)
+    size = len(slots)
+    normal = np.diag(np.array(precision)) if size else np.zeros((0, 0))
+    right = np.zeros(size)
+    for s in sums:
+        here = [k for k, (_, scope) in enumerate(slots) if _covers(scope, s)]
+        columns = [slots[k][0] for k in here]
+        normal[np.ix_(here, here)] += s.gram[np.ix_(columns, columns)]
+        right[here] += s.gram[columns, 0]
+    if not size:
+        return Solution(tuple(groups), (), np.zeros(0), np.zeros((0, 0)), 0.0)
+    scale = np.sqrt(np.diag(normal))
+    scale[scale == 0.0] = 1.0  # a column that nothing excites
+    scaled = normal / np.outer(scale, scale) + _JITTER * np.eye(size)
+    inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
+    values = inverse @ right
+    return Solution(tuple(groups), tuple(slots), values, inverse, float(right @ values))
+
+
+def within_bounds(solution: Solution) -> bool:
+    """Tell whether no amplitude is outside what its effect can be, by more than twice its standard deviation."""
+    allowed = {
+        column: bounds
+        for group in solution.groups
+        if group.bounds
+        for column, bounds in zip(group.columns, group.bounds, strict=True)
+    }
+    for (column, _), value, variance in zip(solution.slots, solution.values, np.diag(solution.covariance), strict=True):
+        if column in allowed:
+            low, high = allowed[column]
+            slack = _BOUND_SDS * float(np.sqrt(max(variance, 0.0)))
+            if not low - slack <= value <= high + slack:
+                return False
+    return True
+
+
+def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
+    """Return by how much amplitudes from elsewhere lower the squares of recordings that no fit saw.
+
+    Amplitudes that belong to a session are solved there, and cost what so many free amplitudes gain on noise.
+    """
+    fixed = [k for k, (_, scope) in enumerate(solution.slots) if scope == ""]
+    own = sorted({column for column, scope in solution.slots if scope != ""})
+    total = 0.0
+    columns = [solution.slots[k][0] for k in fixed]
+    theta = solution.values[fixed]
+    for s in held:
+        total += float(2.0 * theta @ s.gram[columns, 0] - theta @ s.gram[np.ix_(columns, columns)] @ theta)
+        if own:
+            right = s.gram[own, 0] - s.gram[np.ix_(own, columns)] @ theta
+            normal = s.gram[np.ix_(own, own)]
+            normal = normal + _JITTER * np.trace(normal) * np.eye(len(own))
+            total += float(right @ np.linalg.solve(normal, right)) - len(own)
+    return total
+
+
+@dataclass(slots=True)
+class Judge:
+    """Training recordings, recordings that no fit sees, and the library that competes."""
+
+    training: list[Sums]
+    held: list[Sums]
+    base: list[Group]
+    library: list[Group]
+    thresholds: tuple[float, float] = (0.0, 0.0)
+    trace: list[str] = field(default_factory=list)
+
+    def gains(self, groups: Sequence[Group]) -> tuple[float, float]:
+        """Return (gain on training, gain on held-out recordings) of base and `groups`.
+
+        Without recordings kept apart, each training recording is held out once.
+        """
+        training, held = self.training, self.held
+        whole = solve([*self.base, *groups], training)
+        if held:
+            return whole.gain, held_out_gain(whole, held)
+        if len(training) == 1:
+            return whole.gain, whole.gain
+        apart = 0.0
+        for k in range(len(training)):
+            others = training[:k] + training[k + 1 :]
+            apart += held_out_gain(solve([*self.base, *groups], others), [training[k]])
+        return whole.gain, apart
+
+    def calibrate(self) -> None:
+        """Set thresholds: the quantile of the best gains of the whole library on noise."""
+        best = np.zeros((2, self.training[0].nulls.shape[0]))
+        for _, trained, apart in self.additions([], on_noise=True):
+            best = np.maximum(best, [trained, apart])
+        self.thresholds = (float(np.quantile(best[0], NULL_QUANTILE)), float(np.quantile(best[1], NULL_QUANTILE)))
+
+    def additions(
+        self, chosen: Sequence[Group], on_noise: bool = False
+    ) -> Iterator[tuple[Group, np.ndarray, np.ndarray]]:
+        """Yield what each term of the library gains beside `chosen`, on training and on held-out recordings.
+
+        Shape (1,) each; with `on_noise` one element a draw of noise in the innovations' place. The same as `gains`
+        with and without the term, at the cost of one elimination a fold instead of one a term.
+        """
+        whole = _Fold([*self.base, *chosen], self.training, self.held or self.training, on_noise)
+        folds = [whole]
+        if not self.held and len(self.training) > 1:
+            folds = [
+                _Fold([*self.base, *chosen], self.training[:k] + self.training[k + 1 :], [self.training[k]], on_noise)
+                for k in range(len(self.training))
+            ]
+        taken = {group.key for group in chosen}
+        for group in self.library:
+            if group.key in taken:
+                continue
+            trained, apart = whole.added(group)
+            if folds[0] is not whole:
+                apart = sum((fold.added(group)[1] for fold in folds), np.zeros(1))
+            elif not self.held:
+                apart = trained
+            yield group, trained, apart
+
+    def reducible(self, groups: Sequence[Group]) -> tuple[float, float]:
+        """Return what is left above the floor on training and held-out recordings, in squares of the noise."""
+        gain = self.gains(groups)
+        held = self.held or self.training
+        left = sum(s.gram[0, 0] - s.count for s in self.training) - gain[0]
+        apart = sum(s.gram[0, 0] - s.count for s in held) - gain[1]
+        return max(left, 0.0), max(apart, 0.0)
+
+    def select(self, most: int = 8) -> list[Group]:
+        """Add the best term as long as one stays, then take back what the others have made superfluous."""
+        chosen: list[Group] = []
+        seen: set[frozenset[tuple[int, ...]]] = set()
+        while len(chosen) < most:
+            left = self.reducible(chosen)
+            ranked = []
+            for group, trained, apart in self.additions(chosen):
+                if self._stays(float(trained[0]), float(apart[0]), left) and not self._allowed([*chosen, group]):
+                    continue
+                ranked.append((float(trained[0]), float(apart[0]), group))
+            passing = [row for row in ranked if self._stays(row[0], row[1], left) and self._agrees(chosen, row[2])]
+            price = self._price()
+            best = max(passing, key=lambda row: row[0] + row[1] - price * row[2].complexity, default=None)
+            top = sorted(ranked, key=lambda row: -(row[0] + row[1]))[:4]
+            self.trace.append(
+                f"left {left[0]:.0f} / {left[1]:.0f}: "
+                + "; ".join(f"{row[2].key} {row[0]:.0f} / {row[1]:.0f}" for row in top)
+            )
+            if best is None:
+                break
+            chosen.append(best[2])
+            chosen = self._without_superfluous(self._swapped(chosen))
+            state = frozenset(group.columns for group in chosen)
+            if state in seen:  # what was added is taken back again
+                break
+            seen.add(state)
+        return self._simplest(chosen)
+
+    def _price(self) -> float:
+        """Return what an amplitude must gain to be worth itself (Schwarz 1978)."""
+        return float(np.log(sum(s.count for s in self.training)))
+
+    def _worth(self, groups: Sequence[Group]) -> float:
+        """Return gains on both kinds of recordings, less the price of the amplitudes."""
+        trained, apart = self.gains(groups)
+        return trained + apart - self._price() * sum(group.complexity for group in groups)
+
+    def _allowed(self, groups: Sequence[Group]) -> bool:
+        """Tell whether every amplitude is one that its effect can have, on the training recordings and on all."""
+        everything = [*self.training, *self.held]
+        return all(within_bounds(solve([*self.base, *groups], part)) for part in (self.training, everything))
+
+    def _swapped(self, chosen: list[Group]) -> list[Group]:
+        """Exchange terms for ones as simple as long as that is worth more: what came first need not be true."""
+        for _ in range(2 * len(chosen)):
+            now, best, better = self._worth(chosen), chosen, 0.0
+            for k, group in enumerate(chosen):
+                taken = {other.key for other in chosen if other is not group}
+                for other in self.library:
+                    if other is group or other.key in taken or other.complexity > group.complexity:
+                        continue
+                    instead = [*chosen[:k], other, *chosen[k + 1 :]]
+                    gain = self._worth(instead) - now
+                    if gain > max(better, ALIAS_GAIN) and self._allowed(instead):
+                        best, better = instead, gain
+            if best is chosen:
+                break
+            chosen = best
+        return chosen
+
+    def _simplest(self, chosen: list[Group]) -> list[Group]:
+        """Take a term with fewer amplitudes wherever it does as well: a superset loses ties."""
+        for k, group in enumerate(chosen):
+            rest = [other for other in chosen if other is not group]
+            now, without = sum(self.gains(chosen)), sum(self.gains(rest))
+            for other in sorted(self.library, key=lambda g: g.complexity):
+                if other.complexity >= group.complexity or other.key in {g.key for g in rest}:
+                    continue
+                instead = [*chosen[:k], other, *chosen[k + 1 :]]
+                loss = now - sum(self.gains(instead))
+                if loss < max(ALIAS_GAIN, _ALIAS_SHARE * (now - without)) and self._allowed(instead):
+                    chosen = instead
+                    break
+        return chosen
+
+    def _agrees(self, chosen: Sequence[Group], group: Group) -> bool:
+        """Tell whether training and held-out recordings ask for the same amplitudes: a law is one law."""
+        if not self.held or group.scope != "structural":
+            return True
+        values = [solve([*self.base, *chosen, group], part).of(group) for part in (self.training, self.held)]
+        (a, a_sd), (b, b_sd) = values
+        allowed = np.maximum(_AGREE_SDS * np.hypot(a_sd, b_sd), _AGREE_RATIO * np.maximum(np.abs(a), np.abs(b)))
+        return bool(np.all(np.abs(a - b) <= allowed))
+
+    def _stays(self, trained: float, apart: float, left: tuple[float, float]) -> bool:
+        """Tell whether gains are beyond noise, and material beside what is left, on whichever side more is left."""
+        before = self.reducible([])
+        shares = [now / first if first > 0.0 else 0.0 for now, first in zip(left, before, strict=True)]
+        share = MATERIAL_RATIO * max(shares)
+        return trained > max(self.thresholds[0], share * before[0]) and apart > max(
+            self.thresholds[1], share * before[1]
+        )
+
+    def _without_superfluous(self, chosen: list[Group]) -> list[Group]:
+        """Take terms back whose loss is below the thresholds now, the least useful first."""
+        while len(chosen) > 1:
+            now = self.gains(chosen)
+            losses = []
+            for group in chosen:
+                rest = [other for other in chosen if other is not group]
+                gains = self.gains(rest)
+                losses.append((now[0] - gains[0], now[1] - gains[1], group))
+            weakest = min(losses, key=lambda row: row[0] + row[1])
+            if self._stays(weakest[0], weakest[1], (0.0, 0.0)):
+                return chosen
+            chosen = [other for other in chosen if other is not weakest[2]]
+        return chosen
+
+    def aliases(self, chosen: Sequence[Group], group: Group) -> list[tuple[object, float]]:
+        """Return the keys that would do as well as `group` beside the others, with the margin that they lose by."""
+        everything = [*self.training, *self.held]
+        rest = [other for other in chosen if other is not group]
+        with_it = solve([*self.base, *chosen], everything).gain
+        without = solve([*self.base, *rest], everything).gain
+        limit = max(ALIAS_GAIN, _ALIAS_SHARE * (with_it - without))
+        margins: dict[object, float] = {}
+        taken = {other.key for other in chosen}
+        for other in self.library:
+            if other.key in taken:
+                continue
+            instead = solve([*self.base, *rest, other], everything)
+            if not within_bounds(instead):
+                continue
+            margin = with_it - instead.gain
+            if other.key not in margins or margin < margins[other.key]:
+                margins[other.key] = margin
+        return sorted(((key, margin) for key, margin in margins.items() if margin < limit), key=lambda row: row[1])
+
+
+class _Fold:
+    """Groups solved on some recordings and judged on others, ready to say what one more group would gain."""
+
+    def __init__(self, groups: Sequence[Group], fitted: Sequence[Sums], judged: Sequence[Sums], on_noise: bool):
+        self._fitted, self._judged, self._on_noise = fitted, judged, on_noise
+        self._slots, precision = _slots_of(groups, fitted)
+        self._rights = {id(s): _right(s, on_noise) for s in [*fitted, *judged]}
+        normal = self._cross(self._slots, self._slots, fitted) + np.diag(precision)
+        scale = np.sqrt(np.diag(normal))
+        scale[scale == 0.0] = 1.0
+        weights = np.outer(scale, scale)
+        self._inverse = np.linalg.inv(normal / weights + _JITTER * np.eye(scale.size)) / weights
+        self._values = self._inverse @ self._seen(self._slots, fitted)
+        self._apart = self._judged_gain(self._slots, self._values)
+
+    def added(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
+        """Return (gain where it is fitted, gain where it is judged) of one group more, one element a right side."""
+        slots, precision = _slots_of([group], self._fitted)
+        cross = self._cross(self._slots, slots, self._fitted)
+        back = self._inverse @ cross
+        normal = self._cross(slots, slots, self._fitted) + np.diag(precision) - cross.T @ back
+        right = self._seen(slots, self._fitted) - cross.T @ self._values
+        scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+        if not np.all(scale > 0.0):
+            return np.zeros(right.shape[1]), np.zeros(right.shape[1])
+        weights = np.outer(scale, scale)
+        scaled = normal / weights + _JITTER * np.eye(scale.size)
+        values = np.linalg.solve(scaled, right / scale[:, None]) / scale[:, None]
+        together = np.vstack([self._values - back @ values, values])
+        gain = np.einsum("ij,ij->j", right, values)
+        return gain, self._judged_gain([*self._slots, *slots], together) - self._apart
+
+    def _judged_gain(self, slots: list[tuple[int, str]], values: np.ndarray) -> np.ndarray:
+        fixed = [k for k, (_, scope) in enumerate(slots) if scope == ""]
+        own = sorted({column for column, scope in slots if scope != ""})
+        columns, theta = [slots[k][0] for k in fixed], values[fixed]
+        total = np.zeros(values.shape[1])
+        for s in self._judged:
+            right = self._rights[id(s)]
+            bent = s.gram[np.ix_(columns, columns)] @ theta
+            total += 2.0 * np.einsum("ij,ij->j", theta, right[columns]) - np.einsum("ij,ij->j", theta, bent)
+            if own:
+                rest = right[own] - s.gram[np.ix_(own, columns)] @ theta
+                normal = s.gram[np.ix_(own, own)]
+                normal = normal + _JITTER * np.trace(normal) * np.eye(len(own))
+                total += np.einsum("ij,ij->j", rest, np.linalg.solve(normal, rest)) - len(own)
+        return total
+
+    def _seen(self, slots: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
+        total = np.zeros((len(slots), self._rights[id(sums[0])].shape[1]))
+        for s in sums:
+            here = [k for k, (_, scope) in enumerate(slots) if _covers(scope, s)]
+            total[here] += self._rights[id(s)][[slots[k][0] for k in here]]
+        return total
+
+    @staticmethod
+    def _cross(a: list[tuple[int, str]], b: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
+        total = np.zeros((len(a), len(b)))
+        for s in sums:
+            rows = [k for k, (_, scope) in enumerate(a) if _covers(scope, s)]
+            columns = [k for k, (_, scope) in enumerate(b) if _covers(scope, s)]
+            part = s.gram[np.ix_([a[k][0] for k in rows], [b[k][0] for k in columns])]
+            total[np.ix_(rows, columns)] += part
+        return total
+
+
+def _covers(scope: str, s: Sums) -> bool:
+    return scope in ("", f"session {s.session}", f"run {s.run}")
+
+
+def _right(s: Sums, on_noise: bool) -> np.ndarray:
+    """Return what the columns see, row 0 the innovations' own square, shape (1 + columns, right sides)."""
+    if not on_noise:
+        return s.gram[:, :1]
+    return np.vstack([np.full(s.nulls.shape[0], s.count), s.nulls.T])
+
+
+def _slots_of(groups: Sequence[Group], sums: Sequence[Sums]) -> tuple[list[tuple[int, str]], list[float]]:
+    """Return (column, scope) of every amplitude of some groups, and how well each is known beforehand."""
+    scopes = {
+        "structural": ("",),
+        "session": tuple(sorted({f"session {s.session}" for s in sums})),
+        "run": tuple(sorted({f"run {s.run}" for s in sums})),
+    }
+    slots: list[tuple[int, str]] = []
+    precision: list[float] = []
+    for group in groups:
+        for scope in scopes[group.scope]:
+            for number, column in enumerate(group.columns):
+                slots.append((column, scope))
+                precision.append(group.prior_sds[number] ** -2 if group.prior_sds else 0.0)
+    return slots, precision

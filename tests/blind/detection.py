@@ -1,0 +1,582 @@
+"""What a perfect observer could see: detection limits, parameter errors, and which laws no likelihood ratio separates.
+
+Given the recorded positions and commands, the balance of each axis leaves `mass x acceleration - known forces`. A
+hidden effect adds its own force to it, a wrong base parameter adds its column, sensor noise and the coloured force make
+its spectrum; the recorded current minus the current that the command makes is a further channel. That is the closed
+loop's likelihood, written where its noise is stationary: whitening the closed loop's differences by the noise
+propagated through the loop gives the same numbers (`tests/test_blind.py` holds the two together).
+"""
+
+import copy
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+from scipy import fft, stats
+from scipy.interpolate import CubicSpline
+
+from tests.blind import laws, machine
+from tests.blind.draw import PARAMETER_ERRORS, SENSOR_QUANTUM_M, coloured_power, follows, simulate
+from tests.blind.laws import contact_force, friction_level, is_contact, is_friction, smooth_force, thrust
+from tests.blind.machine import CELLS, SAMPLE_S, STEPS, B
+
+D_PRIME_AT_LIMIT = 5.0
+LIMIT_ROUNDS = 3
+FALSE_RATE = 0.05
+POWER = 0.9
+SEPARABLE_D = float(stats.norm.ppf(POWER) + stats.norm.ppf(1.0 - FALSE_RATE))  # 2.93: power 0.9 at 5 % false
+TAPER_S = 1.0
+SEPARATION_BAND_HZ = 150.0  # laws are told apart below this: only a cyclic error has much above it
+CELL_S = SAMPLE_S / CELLS
+# a cell's weight in the force that the second difference of positions sees: a triangle of one sample to either side
+_UP = (np.arange(CELLS) + 0.5) / CELLS / CELLS
+_DOWN = _UP[::-1].copy()
+NONLINEAR = ("soft_contact", "sensor_delay", "sensor_lag", "command_delay", "current_loop_lag", "amplifier_dead_band")
+
+
+def to_samples(cells):
+    """Force over cells of 0.25 ms, as the second difference of positions sees it at samples 1..n-2."""
+    blocks = cells.reshape(-1, CELLS)
+    return blocks[:-2] @ _UP + blocks[1:-1] @ _DOWN
+
+
+def second_difference(x):
+    """Acceleration at samples 1..n-2."""
+    return (x[2:] - 2.0 * x[1:-1] + x[:-2]) / SAMPLE_S**2
+
+
+@njit(cache=True)
+def actuator(commands, delay, lag, dead):
+    """(mean current over cells, current at samples) of commands in A."""
+    n = len(commands)
+    cells, samples = np.zeros(n * CELLS), np.zeros(n)
+    current = 0.0
+    for k in range(n):
+        samples[k] = current
+        for j in range(STEPS):
+            current, mean = machine.loop_step(current, commands, k, j * machine.STEP_S, delay, lag, dead)
+            cells[k * CELLS + j // machine.CELL_STEPS] += mean / machine.CELL_STEPS
+    return cells, samples
+
+
+@njit(cache=True)
+def along(code, place, p, cells, mass1, mass2, start, t0, contact):
+    """Force (2, cells) of a law along a recorded motion; dry friction has the direction that the record shows."""
+    n = cells.shape[0]
+    out = np.zeros((2, n))
+    mem1, mem2 = np.zeros(laws.MEMORIES), np.zeros(laws.MEMORIES)
+    empty, plain = np.zeros(laws.PARAMETERS), np.zeros(laws.MEMORIES)
+    both = code == 18 or code == 29
+    if code == 28:
+        mem1[0] = mem2[0] = start
+    for i in range(n):
+        x1, v1, x2, v2, drive1, drive2 = cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3], cells[i, 4], cells[i, 5]
+        t = (i + 0.5) * CELL_S
+        r = x2 - x1
+        if is_contact(code):
+            f = contact_force(code, p, mem1, CELL_S, t0 + t, r, v2 - v1, contact)
+            f -= contact_force(-1, empty, plain, 0.0, 0.0, r, v2 - v1, contact)
+            out[0, i], out[1, i] = f, -f
+            continue
+        if is_friction(code):
+            if place == 0:
+                s = math.copysign(1.0, cells[i, 6])
+                out[0, i] = -cells[i, 6] * friction_level(code, p, mem1, CELL_S, x1, v1, drive1, s)
+            else:
+                s = math.copysign(1.0, cells[i, 7])
+                out[1, i] = -cells[i, 7] * friction_level(code, p, mem2, CELL_S, x2, v2, drive2, s)
+            continue
+        if place == 0 or both:
+            out[0, i] = smooth_force(code, p, mem1, CELL_S, t, x1, v1, drive2, mass1)
+        if place == 1 or both:
+            out[1, i] = smooth_force(code, p, mem2, CELL_S, t, x2, v2, drive1, mass2)
+    if code == 28:
+        for i in range(1, n - 1):
+            if place == 0:
+                out[0, i] += p[0] * mass1 * (cells[i + 1, 1] - cells[i - 1, 1]) / (2.0 * CELL_S)
+            else:
+                out[1, i] += p[0] * mass2 * (cells[i + 1, 3] - cells[i - 1, 3]) / (2.0 * CELL_S)
+    return out
+
+
+class Evidence:
+    """The whitened record of a simulated case: what base parameters and effects would add to it."""
+
+    def __init__(self, case, runs, band_hz=0.5 / SAMPLE_S):
+        """`runs`: simulated with the effects along which everything is judged; above `band_hz` nothing counts."""
+        self.case, self.runs, self.band_hz = case, runs, band_hz
+        self._plain = {}
+        self.base = case.base
+        self.gains = [self._whitening(run) for run in runs]
+        self.contact = np.array([case.base[i] for i in range(6, 11)])
+        self.base_columns = {name: self._base_column(name) for name in case.base_names}
+        self.names = [name for name in case.base_names if case.uncertainty[name] > 0.0]
+        self.set_nuisance()
+
+    # ---- whitening ----
+
+    def _whitening(self, run):
+        """(factors on the spectrum of each channel: two forces, two currents, None where absent; taper; FFT length)."""
+        m = len(run.samples) - 2
+        length = fft.next_fast_len(m, real=True) or m
+        f = np.fft.rfftfreq(length, SAMPLE_S)
+        f = f[f <= self.band_hz]
+        difference = 4.0 * np.sin(math.pi * f * SAMPLE_S) ** 2 / SAMPLE_S**2
+        triangle = np.sinc(f * SAMPLE_S) ** 4
+        gains = []
+        for place in range(2):
+            noise = self.case.sensor_noise_m[place] ** 2 + SENSOR_QUANTUM_M**2 / 12.0
+            power = coloured_power(f) * triangle + (self._mass(run, place) * difference) ** 2 * noise
+            gains.append(np.sqrt(2.0 / (length * power)))
+        for place in range(2):
+            power = self.case.current_noise_a[place] ** 2 + self.case.current_quantum_a[place] ** 2 / 12.0
+            gains.append(np.full(len(f), math.sqrt(2.0 / (length * power))))
+        for gain in gains:
+            gain[0] *= math.sqrt(0.5)
+        if self.case.single:
+            gains[1] = gains[3] = None
+        ramp = np.minimum(np.arange(m) * SAMPLE_S, np.arange(m)[::-1] * SAMPLE_S) / min(TAPER_S, 0.1 * m * SAMPLE_S)
+        return gains, np.sin(0.5 * math.pi * np.minimum(ramp, 1.0)) ** 2, length
+
+    def narrowed(self, band_hz):
+        """The same evidence with nothing above `band_hz`."""
+        other = copy.copy(self)
+        other.band_hz = band_hz
+        other.gains = [other._whitening(run) for run in self.runs]
+        keep = []
+        for wide, narrow in zip(self.gains, other.gains, strict=True):
+            for i in range(4):
+                if wide[0][i] is not None:
+                    one = np.arange(len(wide[0][i])) < len(narrow[0][i])
+                    keep += [one, one]
+        keep = np.concatenate(keep)
+        other.base_columns = {name: column[keep] for name, column in self.base_columns.items()}
+        other.set_nuisance()
+        return other
+
+    def _mass(self, run, place):
+        payload_here = self.case.single == (place == 0)
+        return self.base[B["macro_mass_kg"] if place == 0 else B["micro_mass_kg"]] + run.payload_kg * payload_here
+
+    def whitened(self, channels_of_runs):
+        """One vector of the channels (lists of four arrays at samples 1..n-2, None where nothing) of all runs."""
+        parts = []
+        for (gains, taper, length), channels in zip(self.gains, channels_of_runs, strict=True):
+            for i, gain in enumerate(gains):
+                if gain is None:
+                    continue
+                if channels is None or channels[i] is None:
+                    parts.append(np.zeros(2 * len(gain)))
+                else:
+                    spectrum = fft.rfft(channels[i] * taper, length)[: len(gain)] * gain
+                    parts += [spectrum.real, spectrum.imag]
+        return np.concatenate(parts)
+
+    # ---- columns ----
+
+    def _commands(self, run, place):
+        """Current commands in A."""
+        c = run.control
+        return np.ascontiguousarray(run.samples[:, 2 + place] / c[machine.C["macro_force_constant_n_per_a"] + place])
+
+    def _drive_channels(self, run, place, forces, currents):
+        """Channels of an extra drive force (cells) and current (samples) of one axis."""
+        channels = [None, None, None, None]
+        channels[place] = to_samples(forces)
+        if place == 1:
+            channels[0] = -self.base[B["micro_reaction"]] * channels[1]
+        if currents is not None:
+            channels[2 + place] = currents[1:-1]
+        return channels
+
+    def _actuated(self, run, place):
+        """What a run's commands make without any effect: (mean current over cells, current at samples) in A."""
+        if (run.number, place) not in self._plain:
+            d, tau = self.base[B["macro_command_delay_s"] + place], self.base[B["macro_current_lag_s"] + place]
+            self._plain[run.number, place] = actuator(self._commands(run, place), d, tau, 0.0)
+        return self._plain[run.number, place]
+
+    def _loop_channels(self, run, place, delay, lag, dead):
+        """What a current loop slower by these makes."""
+        plain, commands = self._actuated(run, place), self._commands(run, place)
+        d, tau = self.base[B["macro_command_delay_s"] + place], self.base[B["macro_current_lag_s"] + place]
+        other = actuator(commands, d + delay, tau + lag, dead)
+        constant = self.base[B["macro_force_constant_n_per_a"] + place]
+        return self._drive_channels(run, place, constant * (other[0] - plain[0]), other[1] - plain[1])
+
+    def _base_column(self, name):
+        """Whitened change for a base parameter larger than believed, a unit of it (a relative one where so stated)."""
+        return self.whitened([self._base_channels(run, name) for run in self.runs])
+
+    def _base_channels(self, run, name):
+        cells = run.cells
+        r, speed = cells[:, 2] - cells[:, 0], cells[:, 3] - cells[:, 1]
+        if name in ("macro_mass_kg", "micro_mass_kg"):
+            place = int(name == "micro_mass_kg")
+            channels = [None, None, None, None]
+            channels[place] = -second_difference(run.samples[:, 6 + place])
+            return channels
+        if name in ("macro_force_constant_n_per_a", "micro_force_constant_n_per_a"):
+            place = int(name.startswith("micro"))
+            return self._drive_channels(run, place, cells[:, 4 + place] / self.base[B[name]], None)
+        if name.endswith("command_delay_s") or name.endswith("current_lag_s"):
+            place, step = int(name.startswith("micro")), 5e-6
+            changed = (step, 0.0) if name.endswith("delay_s") else (0.0, step)
+            channels = self._loop_channels(run, place, *changed, 0.0)
+            return [None if channel is None else channel / step for channel in channels]
+        if name == "macro_damping_n_s_per_m":
+            return [to_samples(-cells[:, 1]), None, None, None]
+        if name == "spring_stiffness_n_per_m":
+            force = r
+        elif name == "spring_damping_n_s_per_m":
+            force = speed
+        else:
+            index = B[name] - 6
+            step = (10.0, 10.0, 1e-8, 1e-8, 1.0)[index]
+            changed = self.contact.copy()
+            changed[index] += step
+            force = (_stops(r, speed, changed) - _stops(r, speed, self.contact)) / step
+        return [to_samples(force), -to_samples(force), None, None]
+
+    def effect_column(self, index):
+        """Whitened change by the case's own effect number `index`, as it was in the simulation."""
+        effect = self.case.effects[index]
+        channels_of_runs = []
+        for run in self.runs:
+            if effect.law.family == "sensor":
+                channels_of_runs.append(self._sensor_channels(run, effect.place, run.errors[index]))
+                continue
+            marks = run.marks[index]
+            channels = [to_samples(marks[0]), to_samples(marks[1]), None, None]
+            if effect.law.name in ("current_loop_lag", "command_delay", "amplifier_dead_band"):
+                channels[2 + effect.place] = run.errors[index][1:-1]
+            channels_of_runs.append(channels)
+        return self.whitened(channels_of_runs)
+
+    def _sensor_channels(self, run, place, error):
+        """A sensor's error in m enters through the masses, the spring and the stops."""
+        channels = [None, None, None, None]
+        inertia = self._mass(run, place) * second_difference(error)
+        if self.case.single:
+            channels[0] = inertia
+            return channels
+        # the believed spring and stops are evaluated where the sensors say the stages are, which may be the other side
+        # of an edge: a difference, no derivative
+        cells, n = run.cells, len(error)
+        there = np.interp((np.arange(n * CELLS) + 0.5) / CELLS, np.arange(n), error if place == 1 else -error)
+        r, speed = cells[:, 2] - cells[:, 0], cells[:, 3] - cells[:, 1]
+        seen = self._between(r + there, speed + np.gradient(there, CELL_S))
+        between = to_samples(seen - self._between(r, speed))
+        channels[0], channels[1] = -between, between
+        channels[place] = channels[place] + inertia
+        return channels
+
+    def _between(self, r, speed):
+        """Force in N of spring, damper and stops on the macro axis at relative positions in m and speeds in m/s."""
+        force = self.base[B["spring_stiffness_n_per_m"]] * r + self.base[B["spring_damping_n_s_per_m"]] * speed
+        return force + _stops(r, speed, self.contact)
+
+    def law_channels(self, run, law, acts_on, values):
+        """Channels of any law along a run's record."""
+        place = 1 if acts_on in ("micro_force", "micro_actuator", "micro_command", "end_sensor") else 0
+        p = law.vector(values)
+        if law.name == "command_delay":
+            return self._loop_channels(run, place, p[0], 0.0, 0.0)
+        if law.name == "current_loop_lag":
+            return self._loop_channels(run, place, 0.0, p[0], 0.0)
+        if law.name == "amplifier_dead_band":
+            return self._loop_channels(run, place, 0.0, 0.0, p[0])
+        if law.family == "actuator":
+            x = run.cells[:, 2 * place]
+            constant = self.base[B["macro_force_constant_n_per_a"] + place]
+            currents = self._actuated(run, place)[0]
+            forces = _thrust_along(law.code, p, constant, currents, x) - constant * currents
+            return self._drive_channels(run, place, forces, None)
+        if law.family == "sensor":
+            return self._sensor_channels(run, place, self._reading_errors(run, law, place, p))
+        forces = along(
+            law.code_at(acts_on),
+            place,
+            p,
+            run.cells,
+            self._mass(run, 0),
+            self._mass(run, 1),
+            run.samples[0, 6 + place],
+            run.start_s,
+            self.contact,
+        )
+        channels = [to_samples(forces[0]), to_samples(forces[1]), None, None]
+        if self.case.single:
+            channels[1] = None
+        return channels
+
+    def _reading_errors(self, run, law, place, p):
+        x = run.samples[:, 6 + place]
+        t = np.arange(len(x)) * SAMPLE_S
+        if law.name in ("sensor_delay", "sensor_lag", "clock_skew"):
+            path = CubicSpline(t, x)
+            if law.name == "sensor_delay":
+                return np.where(t >= p[0], path(np.maximum(t - p[0], 0.0)), x[0]) - x
+            if law.name == "clock_skew":
+                late = t - p[0] * (run.start_s + t)
+                return np.where(late >= 0.0, path(np.maximum(late, 0.0)), x[0]) - x
+            fine = path(np.arange((len(x) - 1) * CELLS + 1) * CELL_S)
+            return _lagged(fine, p[0])[::CELLS] - x
+        return _reading_errors(law.code, p, run.start_s, x)
+
+    # ---- statistics ----
+
+    def set_nuisance(self, free=(), without=()):
+        """Projects out the base parameters but `without` within their uncertainty, and `free` columns of any size."""
+        columns = [self.base_columns[name] * self.case.uncertainty[name] for name in self.names if name not in without]
+        for column in free:
+            norm = np.linalg.norm(column)
+            if norm > 0.0:
+                columns.append(column * (1e6 / norm))
+        rows = np.array(columns)
+        root = np.linalg.cholesky(_products(rows, rows) + np.eye(len(rows)))
+        self._nuisance = np.einsum("ij,jk->ik", np.linalg.inv(root), rows)
+
+    def inner(self, a, b):
+        """Scalar product of two whitened vectors after the nuisances are projected out."""
+        pair = np.array([a, b])
+        seen = _products(pair, self._nuisance)
+        return float(np.einsum("i,i", a, b) - seen[0] @ seen[1])
+
+    def d_prime(self, column, others=()):
+        """Detectability of a column, given that the base is known within its uncertainty and `others` not at all."""
+        self.set_nuisance(others)
+        value = math.sqrt(max(self.inner(column, column), 0.0))
+        self.set_nuisance()
+        return value
+
+    def parameter_column(self, key):
+        """Change by one stated standard deviation of a parameter error."""
+        return sum(self.base_columns[name] * self.case.uncertainty[name] for name in PARAMETER_ERRORS[key])
+
+    def rest_after(self, signal, columns, signed):
+        """Distance d of `signal` from the best mixture of `columns`, nuisances free within their uncertainty."""
+        whole = self.inner(signal, signal)
+        columns = [column for column in columns if column.any()]
+        if not columns:
+            return math.sqrt(max(whole, 0.0))
+        raw = np.array(columns)
+        seen = _products(raw, self._nuisance)
+        gram = _products(raw, raw) - seen @ seen.T
+        target = (_products(raw, signal[None]) - seen @ _products(self._nuisance, signal[None]))[:, 0]
+        if len(columns) == 1 and not signed and target[0] <= 0.0:
+            return math.sqrt(max(whole, 0.0))
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        solution = np.linalg.lstsq(gram / np.outer(scale, scale), target / scale, rcond=1e-10)[0]
+        return math.sqrt(max(whole - float((target / scale) @ solution), 0.0))
+
+    # ---- alternatives ----
+
+    def alternatives(self, hints=()):
+        """Every library law at every place, over a grid of its parameters: (name, acts_on, signed, columns).
+
+        hints: effects whose pitches and frequencies join the grids of the periodic laws.
+        """
+        for law in laws.LIBRARY:
+            if self.case.single and not law.single_axis:
+                continue
+            for acts_on in law.acts_on:
+                if self.case.single and acts_on.startswith(("micro", "end", "contact")):
+                    continue
+                yield from self._grid(law, acts_on, hints)
+
+    def _grid(self, law, acts_on, hints):
+        first = law.parameters[0]
+        middle = math.sqrt(first.low * first.high)
+        if law.name == "contact_damping" and self.case.uncertainty.get("contact_damping_n_s_per_m", 0.0) > 0.0:
+            return  # the model has one already: an error of a parameter
+        if law.name == "micro_reaction" and self.case.belief["micro_reaction"] > 0.0:
+            return
+        sizes = [middle]
+        if law.name in NONLINEAR:
+            sizes = [first.low * (first.high / first.low) ** (i / 3.0) for i in range(4)]
+        points = [{}]
+        for parameter, count in zip(law.parameters[1:], law.grid_counts, strict=False):
+            if parameter.spread in ("phase", "run_phase"):
+                continue
+            grid = parameter.grid(count)
+            if parameter.name in ("pitch_m", "frequency_hz"):
+                grid = grid + [h.values[parameter.name] for h in hints if parameter.name in h.values]
+            points = [point | {parameter.name: value} for point in points for value in grid]
+        for parameter in law.parameters[1:]:
+            if all(parameter.name not in point for point in points) and "phase" not in parameter.spread:
+                points = [point | {parameter.name: math.sqrt(parameter.low * parameter.high)} for point in points]
+        phase = next((parameter for parameter in law.parameters if "phase" in parameter.spread), None)
+        for size in sizes:
+            for point in points:
+                values = {first.name: size} | point
+                if phase is None:
+                    column = self.whitened([self.law_channels(run, law, acts_on, values) for run in self.runs])
+                    yield law.name, acts_on, law.signed, [column]
+                    continue
+                columns = []
+                groups = sorted({run.homing if phase.spread == "phase" else run.number for run in self.runs})
+                for turn in (0.0, 0.5 * math.pi):
+                    channels = [self.law_channels(run, law, acts_on, values | {phase.name: turn}) for run in self.runs]
+                    for group in groups:
+                        part = [
+                            own if (run.homing if phase.spread == "phase" else run.number) == group else None
+                            for run, own in zip(self.runs, channels, strict=True)
+                        ]
+                        columns.append(self.whitened(part))
+                yield law.name, acts_on, True, columns
+
+    def distances(self, signal, hints=()):
+        """{(name, acts_on): smallest distance of `signal` from that law over its grid}, parameter errors included."""
+        nearest = {}
+        for name, acts_on, signed, columns in self.alternatives(hints):
+            distance = self.rest_after(signal, columns, signed)
+            key = (name, acts_on)
+            nearest[key] = min(nearest.get(key, math.inf), distance)
+        for key, names in PARAMETER_ERRORS.items():
+            if all(name in self.names for name in names):
+                nearest[key] = self.rest_after(signal, [self.parameter_column(key)], True)
+        return nearest
+
+
+def _products(a, b):
+    """Scalar products of rows: by einsum, as threaded matrix products of this shape cost ten times more."""
+    return np.einsum("ik,jk->ij", a, b)
+
+
+@njit(cache=True)
+def _stops(r, speed, contact):
+    """Force in N of the stops on the macro axis at relative positions and speeds."""
+    empty, mem = np.zeros(laws.PARAMETERS), np.zeros(laws.MEMORIES)
+    out = np.zeros(len(r))
+    for i in range(len(r)):
+        out[i] = contact_force(-1, empty, mem, 0.0, 0.0, r[i], speed[i], contact)
+    return out
+
+
+@njit(cache=True)
+def _thrust_along(code, p, constant, currents, x):
+    out = np.zeros(len(x))
+    for i in range(len(x)):
+        out[i] = thrust(code, p, constant, currents[i], x[i])
+    return out
+
+
+@njit(cache=True)
+def _reading_errors(code, p, t0, x):
+    out = np.zeros(len(x))
+    for i in range(len(x)):
+        out[i] = laws.reading_error(code, p, t0 + i * SAMPLE_S, x[i])
+    return out
+
+
+@njit(cache=True)
+def _lagged(fine, lag):
+    out = np.zeros(len(fine))
+    out[0] = fine[0]
+    e = math.exp(-CELL_S / lag)
+    for i in range(1, len(fine)):
+        slope = (fine[i] - fine[i - 1]) / CELL_S
+        out[i] = fine[i] - slope * lag + (out[i - 1] - fine[i - 1] + slope * lag) * e
+    return out
+
+
+@dataclass
+class Found:
+    """What the generator itself can say of one hidden effect."""
+
+    d_prime: float
+    limit: float
+    above_twice: bool
+    above_ten_times: bool
+    inseparable: list
+    nearest: dict
+
+
+def amplitude(effect):
+    """An effect's size: its first parameter, without sign."""
+    return abs(effect.values[effect.law.parameters[0].name])
+
+
+def limit_of(case, evidence, index, columns):
+    """(d', limit): d' of effect `index` given the others, and the amplitude where it would be 5.
+
+    d' isn't proportional to the amplitude where the loop's answer to the effect is itself uncertain, so the case is
+    simulated again near the limit, at most three times.
+    """
+    own = evidence.d_prime(columns[index], [column for i, column in enumerate(columns) if i != index])
+    size = amplitude(case.effects[index])
+    if own <= 0.0:
+        return 0.0, math.inf
+    scale, probe = 1.0, own
+    for _ in range(LIMIT_ROUNDS):
+        if abs(math.log(probe / D_PRIME_AT_LIMIT)) < 0.1:
+            break
+        scale *= min(max(D_PRIME_AT_LIMIT / probe, 1.0 / 30.0), 30.0)
+        effects = [effect.scaled(scale) if i == index else effect for i, effect in enumerate(case.effects)]
+        there = replace(case, effects=effects)
+        runs = simulate(there)
+        if not follows(runs):
+            return own, size * scale  # it would be seen long before the loop fails
+        other = Evidence(there, runs)
+        marks = [other.effect_column(i) for i in range(len(effects))]
+        probe = other.d_prime(marks[index], [mark for i, mark in enumerate(marks) if i != index])
+        if probe <= 0.0:
+            return own, math.inf
+    return own, size * scale * D_PRIME_AT_LIMIT / probe
+
+
+def judged(case, separate=True):
+    """(a Found for every hidden effect of a simulated case, {parameter error: Found} of its wrong parameters)."""
+    if not case.effects and not case.parameter_errors:
+        return [], {}
+    evidence = Evidence(case, case.runs)
+    columns = [evidence.effect_column(i) for i in range(len(case.effects))]
+    limits = [limit_of(case, evidence, index, columns) for index in range(len(case.effects))]
+    units = {}
+    for key in case.parameter_errors:
+        others = [evidence.parameter_column(other) for other in case.parameter_errors if other != key]
+        evidence.set_nuisance(others, PARAMETER_ERRORS[key])
+        column = evidence.parameter_column(key)
+        units[key] = math.sqrt(max(evidence.inner(column, column), 0.0))
+    narrow = evidence.narrowed(SEPARATION_BAND_HZ) if separate else evidence
+    del evidence
+    columns = [narrow.effect_column(i) for i in range(len(case.effects))] if separate else []
+    found = []
+    for index, (effect, (own, limit)) in enumerate(zip(case.effects, limits, strict=True)):
+        nearest = {}
+        if separate and amplitude(effect) >= 2.0 * limit:
+            narrow.set_nuisance([column for i, column in enumerate(columns) if i != index])
+            nearest = narrow.distances(columns[index], [] if effect.law.outside else [effect])
+            if effect.law.name == "asymmetric_coulomb_friction":
+                nearest["coulomb_friction+offset", effect.acts_on] = _coulomb_and_offset(narrow, effect, columns[index])
+            nearest.pop((effect.law.name, effect.acts_on), None)
+        found.append(_found(own, limit, amplitude(effect), nearest))
+    wrong = {}
+    for key, size in case.parameter_errors.items():
+        limit = D_PRIME_AT_LIMIT / units[key] if units[key] > 0.0 else math.inf
+        nearest = {}
+        if separate and abs(size) >= 2.0 * limit:
+            others = [narrow.parameter_column(other) for other in case.parameter_errors if other != key]
+            narrow.set_nuisance(others, PARAMETER_ERRORS[key])
+            nearest = narrow.distances(narrow.parameter_column(key) * size)
+            nearest.pop(key, None)
+        wrong[key] = _found(abs(size) * units[key], limit, abs(size), nearest)
+    return found, wrong
+
+
+def _found(own, limit, size, nearest):
+    inseparable = sorted(key for key, distance in nearest.items() if distance < SEPARABLE_D)
+    return Found(own, limit, size >= 2.0 * limit, size >= 10.0 * limit, inseparable, nearest)
+
+
+def _coulomb_and_offset(evidence, effect, signal):
+    columns = []
+    for name in ("coulomb_friction", "offset"):
+        law = laws.BY_NAME[name]
+        values = {law.parameters[0].name: 1.0}
+        columns.append(
+            evidence.whitened([evidence.law_channels(run, law, effect.acts_on, values) for run in evidence.runs])
+        )
+    return evidence.rest_after(signal, columns, True)

@@ -1,0 +1,207 @@
+"""Parts of the gap workflow: whitening, competition, findings on disk, recordings that can't be used."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stagectl.errors import RecordError, RequestError
+from stagectl.gap import innovations
+from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.findings_file import read_findings, write_findings
+from stagectl.gap.innovations import moments
+from stagectl.gap.log import Log, _log_of_rows
+from stagectl.gap.selection import Group, Judge, Sums, solve
+from stagectl.gap.workflow import find
+from stagectl.row import new_rows
+
+H, MASS = 1e-3, 40.0
+
+
+def _moved(force_n: np.ndarray, slow_n: np.ndarray) -> np.ndarray:
+    """Positions of a mass under forces that are constant within each millisecond, in closed form."""
+    acceleration = (force_n + slow_n) / MASS
+    velocity = np.concatenate([[0.0], np.cumsum(acceleration * H)])[:-1]
+    steps = velocity * H + 0.5 * acceleration * H * H
+    return np.concatenate([[0.0], np.cumsum(steps)])[:-1]
+
+
+def _white(position_m, force_n, sensor_m, slow_n=0.05):
+    n = position_m.size
+    corner = 2.0 * np.pi * 2.0
+    gain, variance = innovations.gains(
+        np.ones(n, bool), np.zeros(n, bool), MASS, H, sensor_m, slow_n, corner, 0.0, 1e3
+    )  # fmt: skip
+    return innovations.innovations(position_m, force_n, force_n, gain, variance, MASS, H, corner, 0.0)
+
+
+def test_a_right_model_leaves_white_noise_of_unit_variance():
+    random = np.random.default_rng(4)
+    n, decay = 20_000, np.exp(-2.0 * np.pi * 2.0 * H)
+    slow = np.zeros(n)
+    for k in range(1, n):
+        slow[k] = decay * slow[k - 1] + 0.05 * np.sqrt(1.0 - decay * decay) * random.standard_normal()
+    force = 20.0 * np.sin(2.0 * np.pi * 1.3 * np.arange(n) * H)
+    seen = _moved(force, slow) + 5e-9 * random.standard_normal(n)
+    white = _white(seen, force, 5e-9)[500:]
+    assert np.var(white) == pytest.approx(1.0, abs=0.03)
+    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.03
+
+
+def test_what_is_missing_adds_its_own_column():
+    n = 3000
+    force = 20.0 * np.sin(2.0 * np.pi * 1.3 * np.arange(n) * H)
+    hidden = 0.3 * np.sign(np.sin(2.0 * np.pi * 0.7 * np.arange(n) * H))
+    seen = _moved(force + hidden, np.zeros(n))
+    difference = _white(seen, force, 5e-9) - _white(seen, force + hidden, 5e-9)
+    assert np.allclose(difference, _white(np.zeros(n), -hidden, 5e-9), atol=1e-9 * np.abs(difference).max())
+
+
+def test_forces_early_in_an_interval_move_further():
+    """A push in the first quarter only: mean 1/4; weighted 2 (1 - 1/8) / 4 = 7/16."""
+    mean, early = moments(np.array([[1.0, 0.0, 0.0, 0.0]]))
+    assert mean[0] == 0.25
+    assert early[0] == pytest.approx(7.0 / 16.0)
+
+
+def _sums(random, planted: float, run: str, count: int = 4000) -> Sums:
+    """One recording: innovations with a planted second term, one base column, five terms of which two look alike."""
+    columns = random.standard_normal((count, 6))
+    columns[:, 3] = 0.999 * columns[:, 2] + 0.04 * random.standard_normal(count)
+    z = random.standard_normal(count) + 0.2 * columns[:, 0] + planted * columns[:, 2]
+    block = np.column_stack([z, columns])
+    nulls = random.standard_normal((60, count)) @ columns
+    return Sums(block.T @ block, float(count), run, run, nulls)
+
+
+def _judge(planted: float) -> Judge:
+    random = np.random.default_rng(11)
+    training = [_sums(random, planted, f"run {k}") for k in range(3)]
+    library = [Group(f"term {k}", (k,)) for k in range(2, 7)]
+    judge = Judge(training, [], [Group("base", (1,), prior_sds=(1.0,))], library)
+    judge.calibrate()
+    return judge
+
+
+def test_the_planted_term_is_found_and_its_twin_is_an_alias():
+    judge = _judge(0.3)
+    chosen = judge.select()
+    assert len(chosen) == 1
+    assert chosen[0].key in ("term 3", "term 4")
+    names = {chosen[0].key, *(key for key, _ in judge.aliases(chosen, chosen[0]))}
+    assert "term 3" in names
+    assert solve([*judge.base, chosen[0]], judge.training).of(chosen[0])[0][0] == pytest.approx(0.3, abs=0.03)
+
+
+def test_on_noise_nothing_is_named():
+    assert _judge(0.0).select() == []
+
+
+def test_one_elimination_gives_what_solving_anew_gives():
+    judge = _judge(0.3)
+    start = [judge.library[0]]
+    before = judge.gains(start)
+    for group, trained, apart in judge.additions(start):
+        after = judge.gains([*start, group])
+        assert trained[0] == pytest.approx(after[0] - before[0], abs=1e-5)
+        assert apart[0] == pytest.approx(after[1] - before[1], abs=1e-5)
+
+
+def _axis_log(name: str, friction_n: float, seed: int) -> Log:
+    """An axis under a spring-like controller of its own, with dry friction that nobody is told of; semi-implicit."""
+    random = np.random.default_rng(seed)
+    n, parts = 8000, 20
+    t = np.arange(n) * H
+    reference = 0.02 * np.sin(2.0 * np.pi * (0.4 + 0.1 * seed) * t) + 0.004 * np.sin(2.0 * np.pi * 2.3 * t + seed)
+    speed = np.gradient(reference, H)
+    x, v, seen, command = reference[0], speed[0], np.zeros(n), np.zeros(n)
+    slow, decay = 0.0, np.exp(-2.0 * np.pi * 1.0 * H)
+    for k in range(n):
+        slow = decay * slow + 0.05 * np.sqrt(1.0 - decay * decay) * random.standard_normal()
+        seen[k] = x + 5e-9 * random.standard_normal()
+        command[k] = 4.0e4 * (reference[k] - seen[k]) + 2.5e3 * (speed[k] - v)
+        for _ in range(parts):
+            v += (command[k] - friction_n * np.tanh(v / 1e-4) - 30.0 * v + slow) / MASS * H / parts
+            x += v * H / parts
+    return Log(name, H, seen, command, np.ones(n, bool), "1", reference_m=reference)
+
+
+def _believed() -> Believed:
+    viscous = {"name": "viscous_friction", "acts_on": "macro_force", "damping_n_s_per_m": 33.0}
+    axis = BelievedAxis(MASS * 1.005, 0.4, 5e-9, 0.0)
+    return Believed("axis", H, axis, effects=(viscous,))
+
+
+@pytest.mark.parametrize(("friction_n", "names"), [(0.0, []), (1.0, ["coulomb_friction"])])
+def test_hidden_dry_friction_is_named_and_nothing_where_nothing_is_missing(friction_n, names, tmp_path):
+    logs = [_axis_log(f"run {seed}", friction_n, seed) for seed in (1, 2, 3)]
+    findings = find(_believed(), logs[:2], logs[2:], nulls_count=100)
+    assert [effect.name for effect in findings.named] == names, findings.trace
+    assert findings.verdict == ("found" if names else "nothing")
+    if names:
+        assert findings.named[0].parameters["level_n"] == pytest.approx(friction_n, rel=0.03)
+    path = tmp_path / "findings.json"
+    write_findings(findings, path)
+    again = read_findings(path)
+    assert again.named == findings.named
+    assert again.refitted == findings.refitted
+
+
+def test_same_input_same_answer():
+    logs = [_axis_log(f"run {seed}", 0.5, seed) for seed in (1, 2)]
+    first, second = (find(_believed(), logs, nulls_count=20, seed=3) for _ in range(2))
+    assert dataclasses.asdict(first) == dataclasses.asdict(second)
+
+
+def test_a_recording_on_both_sides_is_refused():
+    log = _axis_log("run 1", 0.0, 1)
+    with pytest.raises(RequestError, match="both training and holdout"):
+        find(_believed(), [log], [log])
+
+
+def _rows(n: int = 2000) -> np.ndarray:
+    rows = new_rows(n)
+    rows["t_ns"] = np.arange(n) * 1_000_000
+    rows["cycle"] = np.arange(n)
+    rows["macro_position_m"] = 0.1 * np.sin(np.arange(n) * 0.01)
+    rows["macro_force_n"] = np.cos(np.arange(n) * 0.01)
+    return rows
+
+
+def _read(rows: np.ndarray) -> Log:
+    return _log_of_rows(rows, "table", H, "1", imported=True)
+
+
+def test_missing_samples_are_predicted_over_and_said():
+    rows = np.delete(_rows(), slice(500, 503))
+    rows["t_ns"] = np.arange(rows.size) * 1_000_000
+    log = _read(rows)
+    assert log.samples_count == 2000
+    assert np.flatnonzero(~log.valid).tolist() == [500, 501, 502]
+    assert "predicted over" in log.remarks[0]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda r: r[:500], "at least 1000"),
+        (lambda r: _with(r, "macro_position_m", r["macro_position_m"] * 1e3), "millimetres"),
+        (lambda r: _with(r, "macro_force_n", 0.0), "constant"),
+        (lambda r: _with(r, "macro_position_m", np.nan), "no column macro_position_m"),
+        (lambda r: _with(r, "t_ns", r["t_ns"] + 50_000_000 * (np.arange(r.size) > 900)), "jumps by 51 ms at row 900"),
+        (lambda r: _with(r, "t_ns", 2 * r["t_ns"]), "every 2 ms, the profile says 1 ms"),
+        (lambda r: _with(r, "cycle", r["cycle"][::-1]), "do not rise"),
+        (lambda r: np.delete(r, np.arange(100, 1500, 3)), "limit 20%"),
+    ],
+)  # fmt: skip
+def test_recordings_that_can_not_be_used_are_refused(spoil, said):
+    rows = spoil(_rows())
+    if "jumps" not in said and "every" not in said:
+        rows["t_ns"] = np.arange(rows.size) * 1_000_000
+    with pytest.raises(RecordError, match=said):
+        _read(rows)
+
+
+def _with(rows: np.ndarray, name: str, values) -> np.ndarray:
+    rows[name] = values
+    return rows
