@@ -75,6 +75,7 @@ def compare(
     controller.restore(controller_state)
     controller.guard["has_drives"] = without_drives
     controller.measurement[...] = measured
+    controller.measurement["sample_t_ns"] -= backend.rig.start_t_ns  # the value seam's time begins with the rig
     simulation = batch.simulation(controller, machine, latch_delay_s=profile.cycle.actuation_delay_s, seed=seed)
     simulation.state[...] = state
     simulation.noise.standard_normal((first_sample, 2))  # what the wire's sensor drew up to here
@@ -89,6 +90,11 @@ def compare(
         devices[f"{axis}_origin_m"] = truth[f"{axis}_zero_m"][in_truth[0]]
         devices[f"{axis}_zero_m"] = getattr(decoder, f"{axis}_zero_counts") * decoder.end_m_per_count
     devices["reading_ratio"] = decoder.end_m_per_count / step_m
+    first = rows[0]
+    if first["samples_new"] > 0 and first["sequence"] < first["cycle"]:  # the line of the cycle before is on its way
+        devices["late_sample"] = first["sequence"]
+        devices["late_t_s"] = 1e-9 * (first["sample_t_ns"] - backend.rig.start_t_ns)
+        devices["late_macro_m"], devices["late_end_m"] = first["macro_position_m"], first["end_position_m"]
     setpoints = np.zeros(rows.size, SETPOINT)
     for name in SETPOINT.names or ():
         setpoints[name] = rows[f"setpoint_{name}"]
