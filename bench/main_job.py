@@ -87,8 +87,9 @@ def _servo(folder: Path) -> tuple[Figure, float]:
     except StagectlError as error:
         return absent(SERVO, f"no real-time run on this host: {error}"), _DEFAULT_TICK_S
     remark = (
-        f"from when the line is readable and the cycle due; {found['due_to_written'] * 1e6:.0f} us from due, late "
-        f"lines included; of it decoding, tick and encoding {found['tick'] * 1e6:.0f} us"
+        "lines that came when the cycle was due or later; all lines, with the wait for the phase: "
+        f"{found['all_readable_to_written'] * 1e6:.0f} us; from due: {found['due_to_written'] * 1e6:.0f} us, of it "
+        f"decoding, tick and encoding {found['tick'] * 1e6:.0f} us"
     )
     return judged(SERVO, found["readable_to_written"] * 1e6, reason=remark), found["tick"]
 

@@ -85,7 +85,7 @@ class RealtimeTransport:
             if not self._polled:
                 self._look(inbox)
                 self._polled = True
-            elif self._line_within(0.0):
+            elif not self._kept and self._line_within(0.0):  # what is kept already fills the next row
                 self._read(inbox)
         elif self._kept or not self._readable:
             time.sleep((left_ns - _SPIN_NS) * 1e-9)

@@ -529,7 +529,9 @@ def with_identity(profile, **numbers):
 
 def test_every_identity_number_of_the_profile_is_compared(tmp_path, oled_profile, oled_machine):
     profile = with_identity(oled_profile, revision_number=0x10000, serial_number=1)
-    arm(profile, as_hardware(oled_machine), tmp_path / "run")
+    backend = as_hardware(oled_machine)
+    arm(profile, backend, tmp_path / "run")
+    assert backend.servo is not None  # no servo is started before every drive is armed
 
 
 @pytest.mark.parametrize(
@@ -546,11 +548,9 @@ def test_another_unit_than_the_profile_names_is_not_armed(number, pattern, tmp_p
 
 
 def test_the_rig_plays_whatever_unit_a_profile_names(tmp_path, oled_profile, oled_machine):
-    arm(
-        with_identity(oled_profile, vendor_id=0x539, serial_number=7),
-        BatchBackend(oled_machine, seed=SEED),
-        tmp_path / "run",
-    )
+    backend = BatchBackend(oled_machine, seed=SEED)
+    arm(with_identity(oled_profile, vendor_id=0x539, serial_number=7), backend, tmp_path / "run")
+    assert backend.servo is not None
 
 
 GENTLE = {"trip__heartbeat_s": 0.01, "macro__acceleration_limit_m_per_s2": 2.0}

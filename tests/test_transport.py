@@ -77,6 +77,20 @@ def test_what_one_row_can_not_hold_comes_with_the_next_cycle(world):
     assert third.sensor_bytes == b""
 
 
+def test_bytes_that_come_while_others_are_kept_push_none_out(world, monkeypatch):
+    """The port is looked at again in the last stretch before the deadline: a full row must leave it alone."""
+    monkeypatch.setattr("drivers.transport._SPIN_NS", 10 * MS)  # so long that a slow host is awake in it
+    first, second = bytes(range(256)) * 3, b"and more"
+    os.write(world.master, first)
+    transport, inbox = world.transport, Inbox()
+    due_t_ns = transport.now_t_ns() + 20 * MS
+    assert transport.await_bytes(due_t_ns, inbox)
+    os.write(world.master, second)
+    transport.receive(due_t_ns, inbox)
+    received = inbox.sensor_bytes + world.cycle().sensor_bytes + world.cycle().sensor_bytes
+    assert received == first + second
+
+
 def test_the_first_bytes_of_a_cycle_are_there_before_it_is_due_and_keep_their_own_time(world):
     """The servo decodes them meanwhile; what comes later has a time of its own."""
     transport, inbox = world.transport, Inbox()

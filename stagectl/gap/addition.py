@@ -31,16 +31,3 @@ def table_of(effect: Named, session: str) -> dict[str, Any]:
     }
     known = CATALOGUE[effect.name].parameters
     return {"name": effect.name, "acts_on": effect.acts_on} | {name: own.get(name, 0.0) for name in known}
-
-
-def merged(effects: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Put a symmetric viscous friction and what differs from it by direction into one effect, as a profile has it."""
-    kept = [dict(row) for row in effects]
-    for row in kept:
-        if row["name"] != "asymmetric_viscous_friction":
-            continue
-        for other in [r for r in kept if r["name"] == "viscous_friction" and r["acts_on"] == row["acts_on"]]:
-            row["forward_n_s_per_m"] += other["damping_n_s_per_m"]
-            row["backward_n_s_per_m"] += other["damping_n_s_per_m"]
-            kept.remove(other)
-    return kept

@@ -33,12 +33,6 @@ class Term:
         """What it is called and where it acts."""
         return self.name, self.acts_on
 
-    @property
-    def label(self) -> str:
-        """For people."""
-        shape = ", ".join(f"{name} = {value:.4g}" for name, value in self.shape.items())
-        return f"{self.name} on {self.acts_on}" + (f" ({shape})" if shape else "")
-
 
 AS_PARAMETERS = frozenset(
     {

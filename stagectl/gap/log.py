@@ -1,4 +1,4 @@
-"""One recording as the gap workflow sees it: positions, commands, reported forces on the sensor's own grid.
+"""One recording as the gap workflow sees it: positions and commands on the sensor's own grid.
 
 From run folders of ours and from imported tables alike. What can't be used is refused or excluded here, and said.
 Pure but for `read_log`; knows no clock.
@@ -41,8 +41,6 @@ class Log:
     end_position_m: np.ndarray | None = None
     micro_command_n: np.ndarray | None = None
     reference_m: np.ndarray | None = None
-    macro_reported_n: np.ndarray | None = None
-    micro_reported_n: np.ndarray | None = None
     command_extra_n: np.ndarray | None = None  # known, added to the macro's command behind its controller
     macro_payload_kg: float = 0.0
     end_payload_kg: float = 0.0
@@ -57,11 +55,6 @@ class Log:
     def times_s(self) -> np.ndarray:
         """Sample instants since the recording's first."""
         return np.arange(self.samples_count) * self.period_s
-
-    @property
-    def has_micro(self) -> bool:
-        """Whether there is a second axis."""
-        return self.end_position_m is not None
 
 
 def read_log(folder: Path, period_s: float) -> Log:
@@ -135,8 +128,6 @@ def _log_of_rows(rows: np.ndarray, name: str, period_s: float, session: str, imp
         end_position_m=on_grid("end_position_m"),
         micro_command_n=on_grid("micro_force_n"),
         reference_m=on_grid("setpoint_position_m"),
-        macro_reported_n=on_grid("macro_reported_force_n"),
-        micro_reported_n=on_grid("micro_reported_force_n"),
         remarks=tuple(remarks),
     )
 
