@@ -44,6 +44,8 @@ class Log:
     command_extra_n: np.ndarray | None = None  # known, added to the macro's command behind its controller
     macro_payload_kg: float = 0.0
     end_payload_kg: float = 0.0
+    macro_current_a: np.ndarray | None = None  # as the drive reports it at the sample
+    micro_current_a: np.ndarray | None = None
     remarks: tuple[str, ...] = field(default=())
 
     @property
