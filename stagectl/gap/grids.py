@@ -16,6 +16,7 @@ FREE_SHAPES: dict[str, tuple[str, ...]] = {
     "dahl_friction": ("slip_m",),
     "lugre_friction": ("slip_m", "static_ratio", "stribeck_m_per_s"),
     "cable_hysteresis": ("slip_m",),
+    "cable_spring": ("anchor_m",),
     "soft_contact": ("knee_m",),
     "force_constant_saturation": ("saturation_n",),
     "amplifier_dead_band": ("half_width_a",),
