@@ -13,7 +13,8 @@ from pydantic import Field, model_validator
 
 from stagectl import toml_file
 from stagectl.effect_table import EffectTable, without_micro
-from stagectl.profile import Profile, load_profile
+from stagectl.errors import ProfileError
+from stagectl.profile import Profile, search_folders
 from stagectl.toml_file import Document, Table, above, refuse, within
 
 FORCE_CONSTANT_SD_RATIO = 0.01
@@ -135,12 +136,24 @@ class ObservedMachine(Document):
 
 def load_believed(name: str | Path) -> Believed:
     """Load a profile, or the file of an observed machine; ProfileError where it is neither."""
-    path = Path(name)
-    if path.suffix == ".toml" and path.exists():
-        table = tomllib.loads(path.read_text())
-        if "can" not in table:
-            return believed_of_observed(toml_file.read(ObservedMachine, path))
-    return believed_of_profile(load_profile(name))
+    path = toml_file.find(name, search_folders(), "profile")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ProfileError(f"{path}: can't be read ({error.strerror}); check path and permissions") from error
+    document = document_of(content, path)
+    if isinstance(document, ObservedMachine):
+        return believed_of_observed(document)
+    return believed_of_profile(document)
+
+
+def document_of(content: bytes, path: Path) -> Profile | ObservedMachine:
+    """Read what stands in `path`, or is about to, as what it is: only a profile has a bus. Errors: ProfileError."""
+    try:
+        driven = "can" in tomllib.loads(content.decode())
+    except (ValueError, RecursionError):
+        driven = True  # whose reader says what is wrong
+    return toml_file.read_content(Profile if driven else ObservedMachine, content, path)
 
 
 def believed_of_observed(machine: ObservedMachine) -> Believed:
