@@ -56,6 +56,7 @@ def apply(voice: Voice, profile: str, findings: Path, out: Path, candidates: boo
         raise ProfileError(f"{path}: can't be read ({error.strerror}); check path and permissions") from error
     except UnicodeDecodeError as error:
         raise ProfileError(f"{path}: is not UTF-8 text ({error}); save it as UTF-8") from error
+    document_of(old.encode(), path)  # the old one is right by itself, and its own effects are known from here on
     file = findings / FINDINGS if findings.is_dir() else findings
     done = application(old, read_findings(file), candidates=candidates, date=date.today().isoformat())
     content = done.text.encode()

@@ -92,7 +92,7 @@ def _grow(tree: Tree, values: dict[str, Any]) -> None:
         else:
             unit = unit_of(key)
             shown = f"{value:.9g}" if isinstance(value, float) else str(value)
-            tree.add(f"{key} = {shown}" + (f" [dim]{unit}[/]" if unit not in (None, "1") else ""))
+            tree.add(f"{key} = {escape(shown)}" + (f" [dim]{unit}[/]" if unit not in (None, "1") else ""))
 
 
 def names(voice: Voice) -> Answer:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from stagectl import toml_file
+from stagectl.effect_file import EffectFile
 from stagectl.effect_table import EffectTable, without_micro
 from stagectl.errors import ProfileError
 from stagectl.profile import Profile, search_folders
@@ -81,6 +82,7 @@ class Believed:
     effect_sd_ratio: float = EFFECT_SD_RATIO
     effect_sd_ratios: dict[str, float] = field(default_factory=dict)  # by effect, where it is stated
     travel_m: float = 1.0
+    own_effects: tuple[str, ...] = ()  # of the user's files
     source: dict[str, Any] = field(default_factory=dict)
 
 
@@ -125,6 +127,7 @@ class ObservedMachine(Document):
     sensor: SensorTable
     loop: LoopTable | None = None
     effect_sd_ratio: Annotated[float, above(0.0, 100.0)] = EFFECT_SD_RATIO
+    effect_files: tuple[EffectFile, ...] = ()  # before the effects that they declare
     effects: tuple[EffectTable, ...] = ()
 
     @model_validator(mode="after")
@@ -178,6 +181,7 @@ def believed_of_observed(machine: ObservedMachine) -> Believed:
         cascade=cascade,
         effect_sd_ratio=machine.effect_sd_ratio,
         travel_m=body.travel_m,
+        own_effects=tuple(name for file in machine.effect_files for name in file.names),
     )
 
 
@@ -220,4 +224,5 @@ def believed_of_profile(profile: Profile) -> Believed:
         joint=joint,
         effects=tuple(dict(row) for row in profile.effects),
         travel_m=profile.macro.travel_m[1] - profile.macro.travel_m[0],
+        own_effects=tuple(name for file in profile.effect_files for name in file.names),
     )
