@@ -44,6 +44,9 @@ class Log:
     command_extra_n: np.ndarray | None = None  # known, added to the macro's command behind its controller
     macro_payload_kg: float = 0.0
     end_payload_kg: float = 0.0
+    macro_current_a: np.ndarray | None = None  # as the drive reports it at the sample
+    micro_current_a: np.ndarray | None = None
+    start_s: float = 0.0  # since the machine was switched on, or since its first recording: drift and wear know no runs
     remarks: tuple[str, ...] = field(default=())
 
     @property
