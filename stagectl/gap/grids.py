@@ -9,6 +9,7 @@ import numpy as np
 
 from stagectl.effect_text import shape_of
 from stagectl.effects import CATALOGUE, Effect
+from stagectl.effects.table import TABLES
 from stagectl.gap.balance import Recording
 
 _SMOOTHING_M_PER_S = 1e-4
@@ -51,6 +52,7 @@ def grids_for(recordings: list[Recording]) -> Grid:
     }
     mine = recordings[0].believed.own_effects
     own = [known for known in CATALOGUE.values() if known.origin]
+    library |= {name: [] for name in TABLES}  # twelve forces fit anything: never a name
     return library | {known.name: _grid_of(known) if known.name in mine else [] for known in own}
 
 
