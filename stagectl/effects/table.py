@@ -4,6 +4,8 @@ What repeats and has no name is written so, by a search that found only its curv
 holds.
 """
 
+from typing import Any
+
 import numpy as np
 
 from stagectl.compiled import compiled
@@ -19,7 +21,7 @@ TABLES = {
 """Every table and what it is over; a table never counts as a name."""
 
 _AXES = ("macro_force", "micro_force")
-_FORCES = {f"force_{k}_n": (-1e4, 1e4) for k in range(1, KNOTS_COUNT + 1)}
+_FORCES: dict[str, Any] = {f"force_{k}_n": (-1e4, 1e4) for k in range(1, KNOTS_COUNT + 1)}
 _REFERENCE = "de Boor, A Practical Guide to Splines, chapter III: linear interpolation"
 
 
