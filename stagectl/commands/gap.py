@@ -41,7 +41,7 @@ def search(
 
 
 def _log(run: str, runs_root: Path, believed: Believed) -> Log:
-    return read_log(folder_of(run, runs_root), believed.period_s)
+    return read_log(folder_of(run, runs_root), believed.period_s, believed)
 
 
 def _named(findings: Findings) -> Table:

@@ -4,6 +4,7 @@ Made from a profile of ours, or from a file of the same manner for a machine tha
 `load_believed`.
 """
 
+import math
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,6 +48,7 @@ class BelievedAxis:
     latch_s: float = 0.0  # sample instant -> the drive takes over the command of the same row
     latch_sd_s: float = LATCH_SD_S
     current_loop_sd_s: float = CURRENT_LOOP_SD_S
+    force_limit_n: float = math.inf  # of its commands
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +162,7 @@ def believed_of_observed(machine: ObservedMachine) -> Believed:
             body.current_loop_s,
             latch_s=machine.cycle.latch_s,
             latch_sd_s=machine.cycle.latch_sd_s,
+            force_limit_n=math.inf if machine.loop is None else machine.loop.limit_n,
         ),
         effects=tuple(dict(row) for row in machine.effects),
         cascade=cascade,
@@ -178,6 +181,7 @@ def believed_of_profile(profile: Profile) -> Believed:
         profile.macro.current_loop_s,
         profile.macro.rated_force_n / profile.macro.rated_current_a,
         latch_s=profile.cycle.actuation_delay_s,
+        force_limit_n=profile.macro.force_limit_n,
     )
     micro = joint = None
     if profile.micro is not None and profile.backlash is not None:
@@ -188,6 +192,7 @@ def believed_of_profile(profile: Profile) -> Believed:
             profile.micro.current_loop_s,
             profile.micro.rated_force_n / profile.micro.rated_current_a,
             latch_s=profile.cycle.actuation_delay_s,
+            force_limit_n=profile.micro.force_limit_n,
         )
         backlash = profile.backlash
         joint = BelievedJoint(
