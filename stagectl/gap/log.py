@@ -140,7 +140,9 @@ def log_of_rows(
         )
     place = place - place[0]
     count = int(place[-1]) + 1
-    fresh = (rows["samples_new"] > 0) & (rows["sequence"] == rows["cycle"]) if not imported else np.ones(rows.size, bool)
+    fresh = (
+        (rows["samples_new"] > 0) & (rows["sequence"] == rows["cycle"]) if not imported else np.ones(rows.size, bool)
+    )
     columns = {
         column: _on_grid(rows[column].astype(float), place, count, fresh if column.endswith("position_m") else None)
         for column in _COLUMNS
