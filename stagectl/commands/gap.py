@@ -9,11 +9,10 @@ from rich.table import Table
 
 from stagectl.commands.answer import Answer, Voice
 from stagectl.commands.runs import folder_of
-from stagectl.errors import RequestError
-from stagectl.gap import addition, arbiter, findings_page, residual
+from stagectl.gap import addition, arbiter, findings_page, plausibility, residual
 from stagectl.gap.believed import Believed, load_believed
 from stagectl.gap.findings_file import write_findings
-from stagectl.gap.log import Log, constant_columns, read_log
+from stagectl.gap.log import Log, read_log
 from stagectl.gap.workflow import Findings, Named, find
 
 FINDINGS = "findings.json"
@@ -27,10 +26,8 @@ def search(
     believed = load_believed(profile)
     logs = [_log(run, runs_root, believed) for run in training]
     apart = [_log(run, runs_root, believed) for run in held]
-    for log in [*logs, *apart]:
-        dead = constant_columns(log)
-        if dead:
-            raise RequestError(f"{log.name}: {', '.join(dead)} never changes; swapped or dead columns? Map them again")
+    for remark in plausibility.check(believed, logs, apart):
+        voice.warn(remark)
     findings = find(believed, logs, apart, seed=seed, say=lambda step: voice.progress(step, 0.0))
     voice.progress.done()
     for remark in findings.remarks:

@@ -254,7 +254,7 @@ def _figures(findings: Findings, residuals: Sequence[Residual]) -> list[Figure]:
         Figure(
             "Before and after",
             drawn,
-            "Left: how much of the reducible gap is left. Right: the residual force; the black line is the floor, from "
+            "Left: how much of the reducible gap is left. Right: the residual force; the thin line is the floor, from "
             "lap to lap, or from the sensor's noise where no lap repeats.",
             _gap_words(findings, residuals),
         )

@@ -36,6 +36,7 @@ _PERIOD_RATIO = 5e-3  # a period that is wrong by this makes every force wrong b
 _JITTER_RATIO = 0.05  # of a period, rms: at 0.1 m/s and 1 kHz it is 5 um
 _MILLIMETRES_SPAN = 2.0
 _LIMIT_RATIO = 0.999
+_BEYOND_RATIO = 1.5
 _UNDER_LAW = (Phase.TRACKING, Phase.STOPPING)  # in a guided stop the macro's drive makes its own force
 
 
@@ -58,7 +59,7 @@ class Log:
     command_extra_n: np.ndarray | None = None  # known, added to the macro's command behind its controller
     macro_payload_kg: float = 0.0
     end_payload_kg: float = 0.0
-    macro_current_a: np.ndarray | None = None  # as the drive reports it at the sample
+    macro_current_a: np.ndarray | None = None  # as the drive reports it at the sample; ours at the SYNC behind it
     micro_current_a: np.ndarray | None = None
     remarks: tuple[str, ...] = field(default=())
 
@@ -175,8 +176,8 @@ def log_of_rows(
         end_position_m=values.get("end_position_m"),
         micro_command_n=values.get("micro_force_n"),
         reference_m=values.get("setpoint_position_m"),
-        macro_current_a=_current_a(values, "macro", believed),
-        micro_current_a=_current_a(values, "micro", believed),
+        macro_current_a=_current_a(values, "macro", believed, imported),
+        micro_current_a=_current_a(values, "micro", believed, imported),
         remarks=tuple(remarks),
     )
 
@@ -282,7 +283,8 @@ def _unsaturated(
 ) -> slice:
     """Return the longest stretch in which no command stands at its limit for long.
 
-    What the force does meanwhile nobody knows, and the motion remembers it: the stretches are not joined.
+    What the force does meanwhile nobody knows, and the motion remembers it: the stretches are not joined. A command far
+    beyond its limit is none of this profile, or in another unit. Errors: RecordError.
     """
     count = values["macro_force_n"].size
     least = max(2, round(SATURATED_S / period_s))
@@ -291,6 +293,12 @@ def _unsaturated(
         belief = None if believed is None else getattr(believed, axis)
         if column not in values or belief is None or not math.isfinite(belief.force_limit_n):
             continue
+        highest_n = float(np.max(np.abs(values[column])))
+        if highest_n > _BEYOND_RATIO * belief.force_limit_n:
+            raise RecordError(
+                f"{name}: {column} reaches {highest_n:.4g} N, the profile limits it to {belief.force_limit_n:g} N; "
+                "check the column's unit in the import, or correct the profile's limit"
+            )
         at_limit = np.abs(values[column]) >= _LIMIT_RATIO * belief.force_limit_n
         starts, ends = _stretches(at_limit)
         for start, end in zip(starts, ends, strict=True):
@@ -335,12 +343,16 @@ def _check_values(values: dict[str, np.ndarray], name: str, remarks: list[str]) 
         remarks.append(f"{name}: the macro moved by {moved_m * 1e6:.1f} um only; what depends on motion is not seen")
 
 
-def _current_a(values: dict[str, np.ndarray], axis: str, believed: Believed | None) -> np.ndarray | None:
+def _current_a(
+    values: dict[str, np.ndarray], axis: str, believed: Believed | None, imported: bool
+) -> np.ndarray | None:
     """Return the current behind the force that a drive reports."""
     force_n = values.get(f"{axis}_reported_force_n")
     belief = None if believed is None else getattr(believed, axis)
     if force_n is None or belief is None:
         return None
+    if not imported:  # a row of ours holds what was sampled at the SYNC of the cycle before
+        force_n = np.concatenate([force_n[1:], force_n[-1:]])
     return force_n / belief.force_constant_n_per_a
 
 

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt, welch
+import scipy.signal
+from scipy.signal import butter, sosfiltfilt
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses
@@ -251,13 +252,11 @@ def _residual(recording: Recording, axis: str, held_out: bool, before: Forces, a
     log, motion = recording.log, recording.motion(axis)
     h, mass_kg, noise_m = log.period_s, recording.mass_kg(axis), recording.belief(axis).noise_m
     band_hz = band_of(noise_m, mass_kg, h)
-    raw = [_second_difference_n(recording, axis, forces) for forces in (before, after)]
-    spoilt = _widened(~log.valid, _BRIDGE_COUNT)
-    raw = [_bridged(values, spoilt) for values in raw]
+    raw = [missing_force_n(recording, axis, forces) for forces in (before, after)]
     sos = butter(_ORDER, band_hz * 2.0 * h, output="sos")
     smooth = [np.asarray(sosfiltfilt(sos, values)) for values in raw]
     settle = round(_SETTLE_S / h)
-    counted = ~spoilt
+    counted = ~_spoilt(log)
     counted[:settle] = counted[-settle:] = False
     return Residual(
         run=log.name,
@@ -279,8 +278,11 @@ def _residual(recording: Recording, axis: str, held_out: bool, before: Forces, a
     )
 
 
-def _second_difference_n(recording: Recording, axis: str, forces: Forces) -> np.ndarray:
-    """Return inertia force minus forces at every sample; both ends repeat their neighbour."""
+def missing_force_n(recording: Recording, axis: str, forces: Forces) -> np.ndarray:
+    """Return measured inertia force minus forces at every sample, missing ones bridged; ends repeat their neighbour.
+
+    With no forces it is the inertia force alone.
+    """
     h = recording.log.period_s
     force_n = forces.macro_n if axis == "macro" else forces.end_n
     error_m = forces.macro_sensor_m if axis == "macro" else forces.end_sensor_m
@@ -293,7 +295,12 @@ def _second_difference_n(recording: Recording, axis: str, forces: Forces) -> np.
     following = force_n @ (1.0 - middles) / PARTS_COUNT
     preceding = force_n @ middles / PARTS_COUNT
     inner = recording.mass_kg(axis) * np.diff(position_m, 2) / h**2 - following[1:-1] - preceding[:-2]
-    return np.concatenate([inner[:1], inner, inner[-1:]])
+    return _bridged(np.concatenate([inner[:1], inner, inner[-1:]]), _spoilt(recording.log))
+
+
+def _spoilt(log: Log) -> np.ndarray:
+    """Tell where a second difference rests on a missing sample."""
+    return np.convolve(~log.valid, np.ones(2 * _BRIDGE_COUNT + 1), "same") > 0.5
 
 
 def _scaled(forces: Forces, factor: float) -> Forces:
@@ -301,10 +308,6 @@ def _scaled(forces: Forces, factor: float) -> Forces:
         return None if values is None else factor * values
 
     return Forces(times(forces.macro_n), times(forces.end_n), times(forces.macro_sensor_m), times(forces.end_sensor_m))
-
-
-def _widened(mask: np.ndarray, count: int) -> np.ndarray:
-    return np.convolve(mask, np.ones(2 * count + 1), "same") > 0.5
 
 
 def _bridged(values: np.ndarray, spoilt: np.ndarray) -> np.ndarray:
@@ -333,7 +336,8 @@ def _clustered(
 def _density(signals: Sequence[np.ndarray], length: int, period_s: float) -> np.ndarray:
     """Return the amplitude spectral density of several signals, each as heavy as it is long."""
     densities = [
-        welch(signal, 1.0 / period_s, nperseg=length, detrend="constant")[1] * signal.size for signal in signals
+        signal.size * scipy.signal.welch(signal, 1.0 / period_s, nperseg=length, detrend="constant")[1]
+        for signal in signals
     ]
     return np.sqrt(np.sum(densities, axis=0) / sum(signal.size for signal in signals))
 
