@@ -59,6 +59,11 @@ def test_recordings_that_fit_their_profile_pass(axis_tables, stage_tables, tmp_p
         assert plausibility.check(believed, logs[:1], logs[1:]) == ()
 
 
+def held_between(first: int, behind: int) -> np.ndarray:
+    samples = np.arange(8000)
+    return (samples >= first) & (samples < behind)
+
+
 AXIS_CASES = {
     "command and position swapped": (
         lambda t: with_columns(t, position=t["command"], command=t["position"]),
@@ -83,6 +88,14 @@ AXIS_CASES = {
     ),
     "time in ms": (lambda t: with_columns(t, t_s=t["t_s"] * 2.0), "every 2 ms, the profile says 1 ms"),
     "too short": (lambda t: {name: values[:700] for name, values in t.items()}, "at least 1000"),
+    "a sensor that sticks": (
+        lambda t: with_columns(t, position=np.where(held_between(3000, 3050), t["position"][3000], t["position"])),
+        "stays the same for 50 samples",
+    ),
+    "a sensor at half the rate": (
+        lambda t: with_columns(t, position=np.repeat(t["position"][::2], 2)),
+        "the sensor is slower than the table",
+    ),
     "always at its limit": (
         lambda t: with_columns(t, command=np.where(np.arange(8000) % 900 < 60, 100.0, t["command"])),
         "stand at their limit",

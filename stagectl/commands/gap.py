@@ -26,6 +26,7 @@ def search(
     believed = load_believed(profile)
     logs = [_log(run, runs_root, believed) for run in training]
     apart = [_log(run, runs_root, believed) for run in held]
+    voice.progress("checking the recordings", 0.0)
     for remark in plausibility.check(believed, logs, apart):
         voice.warn(remark)
     findings = find(believed, logs, apart, seed=seed, say=lambda step: voice.progress(step, 0.0))

@@ -202,11 +202,13 @@ def _lines(axes: Axes, bins: Bins, scale: float, after_only: bool = False) -> No
         known = np.isfinite(error)
         if not known.any():  # too few passes to know how much they scatter
             known = np.isfinite(mean)
-        axes.fill_between(
-            middle[known], (mean - 2.0 * error)[known], (mean + 2.0 * error)[known],
-            color=colour, alpha=0.25, linewidth=0.0,
-        )  # fmt: skip
-        axes.plot(middle[known], mean[known], color=colour, linewidth=0.9, label=f"{name} (mean, ±2 standard errors)")
+        shown = np.where(known, mean, np.nan)  # where nothing was measured the line breaks
+        axes.fill_between(middle, shown - 2.0 * error, shown + 2.0 * error, color=colour, alpha=0.25, linewidth=0.0)
+        axes.plot(middle, shown, color=colour, linewidth=0.9, label=f"{name} (mean, ±2 standard errors)")
+        alone = known & ~np.concatenate([known[1:], [False]]) & ~np.concatenate([[False], known[:-1]])
+        axes.errorbar(
+            middle[alone], mean[alone], 2.0 * np.nan_to_num(error[alone]), color=colour, fmt=".", markersize=3.0
+        )
     axes.axhline(0.0, color=MUTED, linewidth=0.6)
     if not bins.middle.size:
         axes.text(0.5, 0.5, "these recordings do not move", transform=axes.transAxes, ha="center", va="bottom")

@@ -114,8 +114,8 @@ def _candidates_table(named: Sequence[Named]) -> Table:
         head = [
             f"{effect.name}{'' if effect.confirmed else ' (candidate)'}",
             effect.acts_on,
-            rounded(effect.gain, 3),
-            rounded(effect.held_out_gain, 3),
+            _grouped(effect.gain),
+            _grouped(effect.held_out_gain),
         ]
         for number, (name, value) in enumerate(effect.parameters.items()):
             name_and_place = _readable(name)
@@ -143,7 +143,14 @@ def _alias_table(named: Sequence[Named]) -> Table:
 
 
 def _margin(margin: float) -> str:
-    return f"{rounded(-margin, 3)} higher" if margin < 0.0 else rounded(margin, 3)
+    return f"{_grouped(-margin)} higher" if margin < 0.0 else _grouped(margin)
+
+
+def _grouped(value: float) -> str:
+    """Round to three digits, thousands apart."""
+    if not abs(value) >= 1e4:
+        return rounded(value, 3)
+    return f"{float(f'{value:.2e}'):,.0f}".replace(",", "\u2009").replace("-", "\u2212")
 
 
 def _parameter_table(errors: Sequence[ParameterError]) -> Table:
@@ -170,7 +177,7 @@ def _gap_table(findings: Findings) -> Table:
         ("training runs", "held-out runs"), findings.reducible_before, findings.reducible_after, strict=True
     ):
         closed = f"{rounded(100.0 * (1.0 - after / before), 3)} %" if before > 0.0 else "nothing to close"
-        rows.append([name, rounded(before, 3), rounded(after, 3), closed])
+        rows.append([name, _grouped(before), _grouped(after), closed])
     note = (
         "What is above the floor, in squares of the noise; 0 is the floor itself. Before: known parameters refitted, "
         "nothing named. On held-out runs every structural value is the one that the training runs gave."
@@ -235,13 +242,12 @@ def _valued(value: float, sd: float | None, unit: str) -> str:
     if sd is None or not (math.isfinite(sd) and sd > 0.0):
         return str(Quantity(value, unit, 4)).replace(" ", _NO_BREAK)
     half = _NORMAL_95 * sd
-    digits = 2 + max(0, math.floor(math.log10(abs(value))) - math.floor(math.log10(half))) if value else 2
-    shown = str(Quantity(value, unit, min(digits, 8)))
-    number, _, symbol = shown.partition(" ")
-    scale = abs(float(number.replace("\u2212", "-")) / value) if value else 1.0
-    decimals = len(number.partition(".")[2])
-    words = [number, "±", f"{half * scale:.{decimals}f}", *([symbol] if symbol else [])]
-    return _NO_BREAK.join(words)
+    largest = max(abs(value), half)
+    number, _, symbol = str(Quantity(largest, unit)).partition(" ")
+    scale = 10.0 ** (3 * round(math.log10(float(number) / largest) / 3.0))
+    decimals = max(1 - math.floor(math.log10(half * scale)), 0)
+    words = [f"{value * scale:.{decimals}f}".replace("-", "\u2212"), "±", f"{half * scale:.{decimals}f}"]
+    return _NO_BREAK.join([*words, *([symbol] if symbol else [])])
 
 
 # ---- figures ----------------------------------------------------------------------------------------------------

@@ -37,6 +37,8 @@ _JITTER_RATIO = 0.05  # of a period, rms: at 0.1 m/s and 1 kHz it is 5 um
 _MILLIMETRES_SPAN = 2.0
 _LIMIT_RATIO = 0.999
 _BEYOND_RATIO = 1.5
+_STUCK_COUNT = 20
+_STUCK_RATIO = 3.0
 _UNDER_LAW = (Phase.TRACKING, Phase.STOPPING)  # in a guided stop the macro's drive makes its own force
 
 
@@ -336,11 +338,42 @@ def _check_values(values: dict[str, np.ndarray], name: str, remarks: list[str]) 
                 f"{name}: {column} spans {span_m:.3g} m; are these millimetres, or is it another column? Give column "
                 "and unit in the import"
             )
+    for column in ("macro_position_m", "end_position_m"):
+        if column in values:
+            _check_alive(values[column], f"{name}: {column}")
     if not np.ptp(values["macro_force_n"]) > 0.0:
         raise RecordError(f"{name}: macro_force_n is constant; swapped columns, or the stage was not driven")
     moved_m = float(np.ptp(values["macro_position_m"]))
     if not moved_m > STILL_M:
         remarks.append(f"{name}: the macro moved by {moved_m * 1e6:.1f} um only; what depends on motion is not seen")
+
+
+def _check_alive(position_m: np.ndarray, place: str) -> None:
+    """Refuse a position that is held while the stage moves: a sensor that stuck, or one slower than the table."""
+    steps_m = np.abs(np.diff(position_m))
+    if not steps_m.any():
+        return  # constant: said elsewhere
+    held = steps_m == 0.0
+    starts, ends = _stretches(held)
+    jumps_m = np.where(ends < steps_m.size, steps_m[np.minimum(ends, steps_m.size - 1)], 0.0)
+    usual_m = float(np.quantile(steps_m[~held], 0.999))
+    stuck = (ends - starts >= _STUCK_COUNT) & (jumps_m > _STUCK_RATIO * usual_m)
+    if stuck.any():
+        first = int(np.argmax(stuck))
+        raise RecordError(
+            f"{place} stays the same for {int(ends[first] - starts[first]) + 1} samples from sample "
+            f"{int(starts[first])} on and then jumps by {jumps_m[first] * 1e6:.3g} um; the sensor stuck: cut the "
+            "recording there"
+        )
+    reach = _STUCK_COUNT // 2
+    least_m = float(steps_m[~held].min())
+    moving = np.abs(position_m[2 * reach :] - position_m[: -2 * reach])[: held.size - reach] > 4 * reach * least_m
+    repeated = float(held[reach : reach + moving.size][moving].mean()) if moving.any() else 0.0
+    if repeated > GAP_LIMIT_RATIO:
+        raise RecordError(
+            f"{place} repeats the sample before in {repeated:.0%} of the samples in motion, limit "
+            f"{GAP_LIMIT_RATIO:.0%}; the sensor is slower than the table: import it at the sensor's own rate"
+        )
 
 
 def _current_a(

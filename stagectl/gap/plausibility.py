@@ -3,7 +3,7 @@ unit or profile comes out as a missing effect.
 
 In a band in which the stage accelerates, inertia force and modelled forces must be the same thing up to what effects
 add; factors and shares are compared, so nothing depends on how large the missing effect is. Limits were set on 190
-bodies in recordings of `tests/blind` (development seeds 20 to 43), EMPS and rig runs. Pure.
+bodies in recordings: `tests/blind` (development seeds 20 to 43), EMPS, rig runs; none of those is refused. Pure.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ from stagectl.gap.log import STILL_M, Log, constant_columns
 _BAND_HZ = (0.2, 30.0)
 _EDGE_S = 0.3
 _BLOCK_S = 0.25  # for the error of a factor; what is left is correlated for less
-_ACCELERATING_M_PER_S2 = 0.02  # rms; 0.009 to 0.6 in the recordings looked at
-_LEAST_EXPLAINED_RATIO = 0.2  # 0.57 and more
-_FACTOR_LIMIT = 3.0  # of one recording: 0.54 to 1.05
+_ACCELERATING_M_PER_S2 = 0.02  # rms; 0.01 to 0.7 in the recordings looked at
+_LEAST_EXPLAINED_RATIO = 0.2  # 0.64 and more
+_FACTOR_LIMIT = 3.0  # of one recording: 0.7 to 1.05
 _FACTOR_SDS = 20.0  # of all recordings together, in what is stated of mass and force constant
 _FACTOR_SIGMAS = 6.0
 _SWAP_RATIO = 0.25  # of the squares that are left

@@ -4,7 +4,7 @@
 
 For forces that are known on parts of intervals this second difference is exact, so nothing is smoothed away. Then r is
 low-passed without delay to the band in which the sensor's own noise, as the profile states it, makes less than
-`NOISE_FORCE_N` of it. Samples that were missing are bridged and left out of all statistics. Pure.
+`NOISE_FORCE_N` of it. Positions of missing samples are interpolated, and left out of all statistics. Pure.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.signal
-from scipy.signal import butter, sosfiltfilt
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, sosfiltfilt, sosfreqz
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses
@@ -34,7 +35,10 @@ _SETTLE_S = 0.3  # at either end the low-pass has seen one side only
 _CLUSTER_S = 0.25  # the force that nobody models is correlated over 80 ms
 _SEGMENT_S = 2.0  # of a spectrum
 _LEAST_CLUSTERS = 3
+_LEAST_VALID_COUNT = 4
 _LEAST_MOVING_RATIO = 0.1
+_NOISE_POINTS_COUNT = 1000
+_BISECTIONS_COUNT = 20
 _PER_DECADE = 60  # points of a spectrum
 
 
@@ -164,17 +168,33 @@ def own_parameters(named: Named, log: Log) -> dict[str, float]:
 
 
 def noise_force_n(noise_m: float, mass_kg: float, period_s: float, band_hz: float) -> float:
-    """Return the rms force that white noise of a position makes below a frequency: m (2 pi f)^2 x, summed."""
-    density = 2.0 * noise_m**2 * period_s
-    return mass_kg * (2.0 * np.pi) ** 2 * float(np.sqrt(density * band_hz**5 / 5.0))
+    """Return the rms that white noise of a position has in a residual force that is low-passed at a frequency."""
+    frequency_hz = np.linspace(0.0, 0.5 / period_s, _NOISE_POINTS_COUNT)
+    response = sosfreqz(_low_pass(band_hz, period_s), frequency_hz, fs=1.0 / period_s)[1]
+    passed = _noise_density(noise_m, mass_kg, period_s, frequency_hz) * np.abs(response) ** 2  # forwards and backwards
+    return float(np.sqrt(np.sum(passed**2) * (frequency_hz[1] - frequency_hz[0])))
+
+
+def _noise_density(noise_m: float, mass_kg: float, period_s: float, frequency_hz: np.ndarray) -> np.ndarray:
+    """Return m times the second difference of white noise of a position, N per root hertz."""
+    turn = 2.0 * np.sin(np.pi * frequency_hz * period_s) / period_s
+    return mass_kg * turn**2 * noise_m * np.sqrt(2.0 * period_s)
+
+
+def _low_pass(band_hz: float, period_s: float) -> np.ndarray:
+    return butter(_ORDER, band_hz * 2.0 * period_s, output="sos")
 
 
 def band_of(noise_m: float, mass_kg: float, period_s: float) -> float:
     """Return the frequency below which a sensor's noise makes `NOISE_FORCE_N` of force, within what can be filtered."""
-    at_one_hz_n = noise_force_n(noise_m, mass_kg, period_s, 1.0)
-    band_hz = (NOISE_FORCE_N / at_one_hz_n) ** 0.4
-    low, high = _BAND_HZ
-    return float(np.clip(band_hz, low, min(high, _BAND_SHARE / period_s)))
+    low, high = _BAND_HZ[0], min(_BAND_HZ[1], _BAND_SHARE / period_s)
+    for _ in range(_BISECTIONS_COUNT):
+        middle = float(np.sqrt(low * high))
+        if noise_force_n(noise_m, mass_kg, period_s, middle) <= NOISE_FORCE_N:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 def binned(residuals: Sequence[Residual], over: str, bins_count: int) -> Bins:
@@ -224,9 +244,7 @@ def spectrum(residuals: Sequence[Residual]) -> Spectrum | None:
     laps = [signal for r in long_enough if (signal := r.floor_signal_n()).size >= length]
     floor = _density(laps, length, period_s) if laps else None
     noise_m, mass_kg = long_enough[0].sensor_noise_m, long_enough[0].mass_kg
-    # The second difference of white noise: (2 sin(pi f h) / h)^4.
-    turn = 2.0 * np.sin(np.pi * frequency_hz * period_s) / period_s
-    sensor = mass_kg * turn**2 * noise_m * np.sqrt(2.0 * period_s)
+    sensor = _noise_density(noise_m, mass_kg, period_s, frequency_hz)
     edges = np.geomspace(frequency_hz[1] * 0.99, frequency_hz[-1] * 1.01, _points_count(frequency_hz))
     place = np.searchsorted(edges, frequency_hz[1:])
 
@@ -253,7 +271,7 @@ def _residual(recording: Recording, axis: str, held_out: bool, before: Forces, a
     h, mass_kg, noise_m = log.period_s, recording.mass_kg(axis), recording.belief(axis).noise_m
     band_hz = band_of(noise_m, mass_kg, h)
     raw = [missing_force_n(recording, axis, forces) for forces in (before, after)]
-    sos = butter(_ORDER, band_hz * 2.0 * h, output="sos")
+    sos = _low_pass(band_hz, h)
     smooth = [np.asarray(sosfiltfilt(sos, values)) for values in raw]
     settle = round(_SETTLE_S / h)
     counted = ~_spoilt(log)
@@ -279,7 +297,7 @@ def _residual(recording: Recording, axis: str, held_out: bool, before: Forces, a
 
 
 def missing_force_n(recording: Recording, axis: str, forces: Forces) -> np.ndarray:
-    """Return measured inertia force minus forces at every sample, missing ones bridged; ends repeat their neighbour.
+    """Return measured inertia force minus forces at every sample; both ends repeat their neighbour.
 
     With no forces it is the inertia force alone.
     """
@@ -289,13 +307,14 @@ def missing_force_n(recording: Recording, axis: str, forces: Forces) -> np.ndarr
     position_m = recording.position_m(axis)
     if error_m is not None:
         position_m = position_m - error_m
+    position_m = _bridged(position_m, recording.log.valid)
     middles = (np.arange(PARTS_COUNT) + 0.5) / PARTS_COUNT
     if force_n is None:
         force_n = np.zeros((position_m.size, PARTS_COUNT))
     following = force_n @ (1.0 - middles) / PARTS_COUNT
     preceding = force_n @ middles / PARTS_COUNT
     inner = recording.mass_kg(axis) * np.diff(position_m, 2) / h**2 - following[1:-1] - preceding[:-2]
-    return _bridged(np.concatenate([inner[:1], inner, inner[-1:]]), _spoilt(recording.log))
+    return np.concatenate([inner[:1], inner, inner[-1:]])
 
 
 def _spoilt(log: Log) -> np.ndarray:
@@ -310,11 +329,15 @@ def _scaled(forces: Forces, factor: float) -> Forces:
     return Forces(times(forces.macro_n), times(forces.end_n), times(forces.macro_sensor_m), times(forces.end_sensor_m))
 
 
-def _bridged(values: np.ndarray, spoilt: np.ndarray) -> np.ndarray:
-    if not spoilt.any() or spoilt.all():
-        return values
-    places = np.arange(values.size)
-    return np.where(spoilt, np.interp(places, places[~spoilt], values[~spoilt]), values)
+def _bridged(position_m: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Put positions where samples were missing, so that what is summed of the force there is right."""
+    if valid.all() or np.count_nonzero(valid) < _LEAST_VALID_COUNT:
+        return position_m
+    places = np.flatnonzero(valid)
+    missing = np.clip(np.flatnonzero(~valid), places[0], places[-1])
+    bridged = position_m.copy()
+    bridged[~valid] = CubicSpline(places, position_m[places])(missing)
+    return bridged
 
 
 def _clustered(
