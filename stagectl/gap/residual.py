@@ -182,7 +182,7 @@ def _noise_density(noise_m: float, mass_kg: float, period_s: float, frequency_hz
 
 
 def _low_pass(band_hz: float, period_s: float) -> np.ndarray:
-    return butter(_ORDER, band_hz * 2.0 * period_s, output="sos")
+    return np.asarray(butter(_ORDER, band_hz * 2.0 * period_s, output="sos"))
 
 
 def band_of(noise_m: float, mass_kg: float, period_s: float) -> float:
