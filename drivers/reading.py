@@ -5,6 +5,7 @@ Pure; knows no protocol, no port and no clock.
 
 import math
 from dataclasses import asdict, dataclass, fields
+from typing import NamedTuple
 
 MACRO_VALID = 1
 """Flag: `macro_counts` may be used."""
@@ -16,8 +17,7 @@ RESTARTED = 8
 """Flag: the device counts its samples anew from here; the sample clock has to start anew too."""
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(NamedTuple):
     """One sample of both axes, in counts of the device (whole and fraction); an invalid count is nan."""
 
     sequence: int  # unwrapped sample number; goes back only where RESTARTED is set

@@ -316,10 +316,9 @@ class WireDecoder:
         seen.samples_new = valid
         seen.sequence = self.sequence
         if self.sequence >= 0:
-            age_ns = sample_clock.sample_age_ns(self.clock, self.sequence, inbox.t_ns)
+            seen.sample_t_ns, age_ns = sample_clock.sample_at(self.clock, self.sequence, inbox.t_ns)
             due = self.sequence + math.floor((age_ns - self._earliest_ns) / self.period_ns)
             self.cycle = max(due, self.cycle + 1 if valid and self.cycle < 0 else self.cycle, self.sequence)
-            seen.sample_t_ns = sample_clock.sample_t_ns(self.clock, self.sequence)
             self._follow_air()
             seen.macro_position_m = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
             seen.end_position_m = (self.end_counts - self.end_zero_counts) * self.end_m_per_count

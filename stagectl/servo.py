@@ -24,6 +24,7 @@ from stagectl.signals import COMMAND, SETPOINT, Stop
 from stagectl.stop_text import emergency_detail, stop_detail
 from stagectl.tracker import LAW_NAMES, Tracker, belief_of
 
+_TRACKING, _TRACK = Phase.TRACKING, Mode.TRACK  # a look-up in an enum costs 0.1 us
 _ENABLE_TIMEOUT_S = 2.0
 _QUICK_STOP_TIMEOUT_S = 5.0
 _HEARTBEATS_PER_TIMEOUT = 4
@@ -362,10 +363,12 @@ class Servo:
         """Move between phases; returns the drive states wanted of macro and micro."""
         off, on = cia402.State.SWITCH_ON_DISABLED, cia402.State.OPERATION_ENABLED
         seen = self._seen
+        silent = t_ns - self._counter_t_ns > self._silence_ns
+        if self.phase is _TRACKING and self._asked.mode == _TRACK and seen.lease_left_ns > 0 and not silent:
+            return on, on  # as in almost every cycle
         mode = Mode(self._asked.mode)
         in_phase_s = (t_ns - self._phase_since_t_ns) * 1e-9
         macro_state = cia402.state_of(seen.macro_statusword)
-        silent = t_ns - self._counter_t_ns > self._silence_ns
         if self.phase in (Phase.IDLE, Phase.HOMED_DRIVE):
             wanted = mode is Mode.TRACK or (mode is Mode.HOME_DRIVE and self.phase is Phase.IDLE)
             if wanted and not silent:
@@ -408,8 +411,7 @@ class Servo:
             elif seen.lease_left_ns <= 0:
                 text = f"it ended {-seen.lease_left_ns * 1e-6:.1f} ms ago; renew it as long as the stage moves"
                 self._end(Stop.LEASE, Phase.STOPPING, t_ns, text)
-            if self.phase is Phase.STOPPING:
-                self._need_no_lease()
+            self._need_no_lease()
             return on, on
         if self.phase is Phase.STOPPING:
             self._need_no_lease()

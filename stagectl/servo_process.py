@@ -122,7 +122,7 @@ def _warm(profile: Profile) -> None:
     for sequence in range(3):
         sample_clock.step(clock, sequence, sequence * 1_000_000)
     sample_clock.sample_t_ns(clock, 3)
-    sample_clock.sample_age_ns(clock, 3, 3_000_000)
+    sample_clock.sample_at(clock, 3, 3_000_000)
     RingWriter(None, slots_count=2)
 
 

@@ -217,6 +217,7 @@ def test_saturated_stretches_are_left_out_and_said(axis_tables, tmp_path):
     believed = load_believed(profile_file(tmp_path))
     log = read_log(run, believed.period_s, believed)
     assert log.samples_count == 5900
+    assert log.start_s == pytest.approx(2.1)  # a drift goes on meanwhile
     assert log.macro_position_m[0] == pytest.approx(axis_tables[0]["position"][2100], abs=1e-12)
     assert "0.1 s (saturated)" in log.remarks[0]
 

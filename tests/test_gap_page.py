@@ -226,10 +226,12 @@ def test_the_unknown_and_wrong_parameters_are_shown(tmp_path):
         "values_n": [0.1, -0.2, 0.3],
         "sds_n": [0.01, 0.01, 0.01],
         "gain": 50.0,
-        "held_out_gain": 40.0,
+        "left": 60.0,
+        "before": 90.0,
+        "beside": [["coulomb_friction", "macro_force"]],
     }
     errors = (
-        ParameterError("macro_mass_kg", 0.052, 0.001, 0.01),
+        ParameterError("macro_mass_kg", 0.052, 0.001, 0.01, ("macro_force_constant",)),
         ParameterError("left_m", -3.2e-6, 0.1e-6, 0.3e-6),
         ParameterError("macro_latch_s", 33e-6, 5e-6, 6e-6),
     )
@@ -239,7 +241,14 @@ def test_the_unknown_and_wrong_parameters_are_shown(tmp_path):
     ladder = [{"run": "a", "with": "before", **gap}]
     page = findings_page.page(findings, residuals, ladder, profile="axis.toml", file=tmp_path / "f.json", seed=0)
     text = page.html().replace("\u00a0", " ")
-    for words in ("5.20 ± 0.20 %", "−3.20 ± 0.20 µm", "33.0 ± 9.8 µs", "What no effect explains", "Closed loop"):
+    for words in (
+        "5.20 ± 0.20 %",
+        "−3.20 ± 0.20 µm",
+        "33.0 ± 9.8 µs",
+        "What no effect explains",
+        "Closed loop",
+        "would explain a part",
+    ):
         assert words in text, words
     assert "from −200 mN to 300 mN" in text
 

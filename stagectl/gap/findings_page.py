@@ -17,6 +17,7 @@ from stagectl.units import unit_of
 
 _NORMAL_95 = 1.96
 _RUNS_SHOWN = 8
+_EDGES = ("left_m", "right_m", "backlash_width_m")
 _NO_BREAK = "\u00a0"
 
 VERDICTS = {
@@ -33,8 +34,9 @@ def verdict_of(findings: Findings) -> str:
     if findings.verdict == "found":
         state = "" if any(effect.confirmed for effect in findings.named) else " None is confirmed yet."
         return f"{names}. {said}{state}"
-    if findings.verdict == "unknown" and names:
-        return f"{said} Besides: {names}."
+    if findings.verdict == "unknown":
+        beside = ", ".join(f"{name} on {place}" for name, place in (findings.unknown or {}).get("beside", ()))
+        return f"{said} No name is stated; {beside} would explain a part." if beside else said
     if findings.verdict == "nothing" and findings.parameter_errors:
         return f"{said} Known parameters are wrong: {', '.join(wrong.name for wrong in findings.parameter_errors)}."
     return said
@@ -102,7 +104,7 @@ def _tables(findings: Findings, residuals: Sequence[Residual], ladder: Sequence[
             made.append(_alias_table(findings.named))
     if findings.parameter_errors:
         made.append(_parameter_table(findings.parameter_errors))
-    made += [_gap_table(findings), _force_table(residuals)]
+    made += [_gap_table(findings), _force_table(residuals, findings.unknown is not None)]
     if ladder:
         made.append(_ladder_table(ladder))
     return made
@@ -136,8 +138,8 @@ def _alias_table(named: Sequence[Named]) -> Table:
         for number, (name, place, margin) in enumerate(effect.aliases)
     ]
     note = (
-        "These runs can't tell the effect from what stands beside it. Margin: by how much the other's gain is lower; "
-        "where it is higher the other has more parameters, or can't be all of the motion."
+        "These runs can't tell the effect from what stands beside it. Margin: by how much the other's gain on all runs "
+        "is lower than that of the effect."
     )
     return Table("As well possible", ["Effect", "Instead", "Margin"], rows, note)
 
@@ -155,16 +157,21 @@ def _grouped(value: float) -> str:
 
 def _parameter_table(errors: Sequence[ParameterError]) -> Table:
     rows: list[list[str | Quantity]] = [
-        [wrong.name, _error_text(wrong.name, wrong.error, wrong.sd), _error_text(wrong.name, wrong.stated_sd)]
+        [
+            wrong.name,
+            _error_text(wrong.name, wrong.error, wrong.sd),
+            _error_text(wrong.name, wrong.stated_sd),
+            ", ".join(wrong.aliases) or "–",
+        ]
         for wrong in errors
     ]
-    note = "Known parameters that the runs contradict, beyond three of the standard deviations that the profile states."
-    return Table("Parameter errors", ["Parameter", "Off by", "Stated, 1 sd"], rows, note)
+    note = "Known parameters that the runs contradict, beyond what the profile states of their uncertainty."
+    return Table("Parameter errors", ["Parameter", "Off by", "Stated, 1 sd", "Or instead"], rows, note)
 
 
 def _error_text(name: str, error: float, sd: float | None = None) -> str:
     """Say an error: metres for an edge and seconds for a time, else a share of the parameter."""
-    unit = "m" if name in ("left_m", "right_m") else "s" if name.endswith(("_latch_s", "_current_loop_s")) else "%"
+    unit = "m" if name in _EDGES else "s" if name.endswith(("_latch_s", "_current_loop_s")) else "%"
     scale = 100.0 if unit == "%" else 1.0
     if sd is None:
         return str(Quantity(scale * error, unit, 2)).replace(" ", _NO_BREAK)
@@ -185,7 +192,7 @@ def _gap_table(findings: Findings) -> Table:
     return Table("Reducible gap", ["", "before", "after", "closed"], rows, note)
 
 
-def _force_table(residuals: Sequence[Residual]) -> Table:
+def _force_table(residuals: Sequence[Residual], unknown: bool) -> Table:
     rows: list[list[str | Quantity]] = []
     for r in residuals:
         floor = r.floor_rms_n
@@ -206,6 +213,8 @@ def _force_table(residuals: Sequence[Residual]) -> Table:
         "Before: the profile as it is. After: with the named effects, and known parameters as refitted. Floor: scatter "
         "from lap to lap, where the reference repeats. Standstill and reversals are left out of a run that moves."
     )
+    if unknown:
+        note += " Nothing is named here: after has the known parameters alone."
     columns = ["Run", "Body", "", "before", "after", "floor", "sensor noise", "band"]
     return Table("Residual force", columns, rows, note)
 
@@ -265,7 +274,7 @@ def _figures(findings: Findings, residuals: Sequence[Residual]) -> list[Figure]:
             _gap_words(findings, residuals),
         )
     ]
-    if findings.unknown is not None:
+    if findings.unknown is not None and "knots" in findings.unknown:
         where = f"over {findings.unknown['over']} at {findings.unknown['acts_on']}"
         made.append(
             Figure(

@@ -63,6 +63,7 @@ class Log:
     end_payload_kg: float = 0.0
     macro_current_a: np.ndarray | None = None  # as the drive reports it at the sample; ours at the SYNC behind it
     micro_current_a: np.ndarray | None = None
+    start_s: float = 0.0  # since the machine was switched on, or since its first recording: drift and wear know no runs
     remarks: tuple[str, ...] = field(default=())
 
     @property
@@ -136,11 +137,13 @@ def log_of_rows(
     """Put rows on the sensor's grid, leave out what can't be used, and say so. Errors: RecordError."""
     remarks: list[str] = []
     place = _places(rows, name, period_s, imported)
+    first_place = place[0] if place.size else 0
     rows, place = _longest_whole(rows, place, name, period_s, remarks)
     if rows.size < LEAST_SAMPLES_COUNT:
         raise RecordError(
             f"{name}: {rows.size} rows in motion, at least {LEAST_SAMPLES_COUNT} are needed; record a longer motion"
         )
+    started = int(place[0] - first_place)
     place = place - place[0]
     count = int(place[-1]) + 1
     fresh = (
@@ -180,6 +183,7 @@ def log_of_rows(
         reference_m=values.get("setpoint_position_m"),
         macro_current_a=_current_a(values, "macro", believed, imported),
         micro_current_a=_current_a(values, "micro", believed, imported),
+        start_s=(started + kept.start) * period_s,
         remarks=tuple(remarks),
     )
 

@@ -156,7 +156,7 @@ def modelled_forces(recording: Recording, findings: Findings) -> Forces:
         effect = CATALOGUE[named.name]
         own = own_parameters(named, recording.log)
         values = [own.get(name, 0.0) for name in effect.parameters]
-        balance.add(total, balance.effect_forces(recording, effect, named.acts_on, values))
+        balance.add(total, balance.effect_forces(recording, effect, named.acts_on, values, whole=True))
     return total
 
 

@@ -1,0 +1,484 @@
+"""Blind sets for the gap workflow: what a user hands over is read, searched, and marked against the sealed truth.
+
+    python -m bench.blind_sets --seeds 100-140 [--kind single] [--workers 2] [--json FILE]
+
+One line a set, then the bars. Sets and their truth are generated once and kept in a folder of their own under a hash
+of the generator's sources (`--sets`), so that a second call takes the searching only.
+"""
+
+import argparse
+import concurrent.futures
+import hashlib
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+import tomllib
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyarrow import csv
+
+from bench.blind_names import in_words_of_the_truth
+from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
+from stagectl.gap.log import Log
+from stagectl.gap.workflow import find
+from tests.blind import generate, score
+
+DURATION_S = 20.0
+LEAST_RUNS_FOR_HOLDOUT_COUNT = 4
+_KNOWN_EXACTLY_RATIO = 1e-6  # a standard deviation of 0 is stated; a prior needs one above
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+# ---- reading a set ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class BlindSet:
+    """One set as a user hands it over."""
+
+    believed: Believed
+    logs: tuple[Log, ...]
+    gains: tuple[dict[str, float], ...]  # of each run's controller
+    starts_s: dict[str, float]  # session time at the start of each run, by the log's name
+    relative_reference_m: tuple[np.ndarray | None, ...]
+
+
+def load_set(folder: Path) -> BlindSet:
+    """Read modeller.toml, runs.toml and the runs of one set."""
+    modeller = tomllib.loads((folder / "modeller.toml").read_text())
+    runs = tomllib.loads((folder / "runs.toml").read_text())["runs"]
+    tables = [_table(folder / run["file"]) for run in runs]
+    period_s = modeller["stage"]["rate_s"]
+    return BlindSet(
+        _believed(folder.name, modeller),
+        tuple(_log(run, table, period_s) for run, table in zip(runs, tables, strict=True)),
+        tuple(run["gains"] for run in runs),
+        {Path(run["file"]).stem: run["starts_at_session_s"] for run in runs},
+        tuple(table.get("relative_reference_m") for table in tables),
+    )
+
+
+def _table(path: Path) -> dict[str, np.ndarray]:
+    table = csv.read_csv(path)
+    return {name: table[name].to_numpy().astype(float) for name in table.column_names}
+
+
+def _log(run: dict[str, Any], table: dict[str, np.ndarray], period_s: float) -> Log:
+    payload = {"macro": 0.0, "end": 0.0} | {run["payload_on"]: run["payload_kg"]}
+    return Log(
+        name=Path(run["file"]).stem,
+        period_s=period_s,
+        macro_position_m=table["macro_position_m"],
+        macro_command_n=_command_n(table, "macro", run["gains"]),
+        valid=np.ones(table["t_s"].size, bool),
+        session=str(run["homing_id"]),
+        end_position_m=table.get("end_position_m"),
+        micro_command_n=_command_n(table, "micro", run["gains"]) if "end_position_m" in table else None,
+        reference_m=table["reference_m"],
+        macro_payload_kg=payload["macro"],
+        end_payload_kg=payload["end"],
+        start_s=run["starts_at_session_s"],
+        macro_current_a=table["macro_current_a"],
+        micro_current_a=table.get("micro_current_a"),
+    )
+
+
+def _command_n(table: dict[str, np.ndarray], axis: str, gains: dict[str, float]) -> np.ndarray:
+    if f"{axis}_command_n" in table:
+        return table[f"{axis}_command_n"]
+    return table[f"{axis}_command_a"] * gains[f"{axis}_force_constant_n_per_a"]
+
+
+def _believed(name: str, modeller: dict[str, Any]) -> Believed:
+    """Say what the modeller states in our words; the modeller's right edge, of end minus macro, is our left one."""
+    values, sds = modeller["values"], modeller["standard_deviations"]
+    single = modeller["stage"]["axes"] == "single"
+
+    def ratio(key: str) -> float:
+        return max(sds[key] / values[key], _KNOWN_EXACTLY_RATIO)
+
+    def axis(side: str, sensor: str) -> BelievedAxis:
+        return BelievedAxis(
+            mass_kg=values[f"{side}_mass_kg"],
+            mass_sd_kg=sds[f"{side}_mass_kg"],
+            noise_m=modeller["sensors"][f"{sensor}_position_noise_m"],
+            current_loop_s=values[f"{side}_current_lag_s"],
+            force_constant_n_per_a=values[f"{side}_force_constant_n_per_a"],
+            force_constant_sd_ratio=ratio(f"{side}_force_constant_n_per_a"),
+            latch_s=values[f"{side}_command_delay_s"],
+            latch_sd_s=sds[f"{side}_command_delay_s"],
+            current_loop_sd_s=sds[f"{side}_current_lag_s"],
+            current_noise_a=float(
+                np.hypot(
+                    modeller["sensors"][f"{side}_current_noise_a"],
+                    modeller["sensors"][f"{side}_current_quantum_a"] / np.sqrt(12.0),
+                )
+            ),
+        )
+
+    joint = None
+    if not single:
+        joint = BelievedJoint(
+            spring_n_per_m=values["spring_stiffness_n_per_m"],
+            damping_n_s_per_m=values["spring_damping_n_s_per_m"],
+            left_m=values["right_edge_m"],
+            right_m=values["left_edge_m"],
+            left_stiffness_n_per_m=values["right_contact_stiffness_n_per_m"],
+            right_stiffness_n_per_m=values["left_contact_stiffness_n_per_m"],
+            width_sd_m=max(sds["left_edge_m"], sds["right_edge_m"]),
+            stiffness_sd_ratio=ratio("spring_stiffness_n_per_m"),
+            damping_sd_ratio=ratio("spring_damping_n_s_per_m"),
+            left_stiffness_sd_ratio=ratio("right_contact_stiffness_n_per_m"),
+            right_stiffness_sd_ratio=ratio("left_contact_stiffness_n_per_m"),
+        )
+    effects: list[dict[str, Any]] = []
+    ratios: dict[str, float] = {}
+    for key, effect, place, parameter in (
+        ("macro_damping_n_s_per_m", "viscous_friction", "macro_force", "damping_n_s_per_m"),
+        ("contact_damping_n_s_per_m", "contact_damping", "contact", "damping_n_s_per_m"),
+        ("micro_reaction", "micro_reaction", "macro_force", "fraction_ratio"),
+    ):
+        if values.get(key, 0.0):
+            effects.append({"name": effect, "acts_on": place, parameter: values[key]})
+            ratios[f"{effect} on {place}"] = ratio(key)
+    return Believed(
+        name=name,
+        period_s=modeller["stage"]["rate_s"],
+        macro=axis("macro", "macro"),
+        micro=None if single else axis("micro", "end"),
+        joint=joint,
+        effects=tuple(effects),
+        effect_sd_ratios=ratios,
+    )
+
+
+def held_out(blind: BlindSet) -> tuple[int, ...]:
+    """Choose the run that a user would keep apart: none of three, one of four or five.
+
+    It is the one that differs in most of homing, payload and gains from all others, the last of equals; never the only
+    one that touches the stops, since then nothing could be learnt of them.
+    """
+    if len(blind.logs) < LEAST_RUNS_FOR_HOLDOUT_COUNT:
+        return ()
+    traits = [
+        (log.session, (log.macro_payload_kg, log.end_payload_kg), tuple(sorted(gains.items())))
+        for log, gains in zip(blind.logs, blind.gains, strict=True)
+    ]
+    touching = [k for k in range(len(blind.logs)) if _touches(blind, k)]
+    free = [k for k in range(len(blind.logs)) if touching != [k]]
+
+    def difference(k: int) -> int:
+        others = traits[:k] + traits[k + 1 :]
+        return sum(all(mine != other[place] for other in others) for place, mine in enumerate(traits[k]))
+
+    return (max(free, key=lambda k: (difference(k), k)),)
+
+
+def _touches(blind: BlindSet, number: int) -> bool:
+    relative_m, joint = blind.relative_reference_m[number], blind.believed.joint
+    if relative_m is None or joint is None:
+        return False
+    return bool(np.max(relative_m) > joint.left_m or np.min(relative_m) < -joint.right_m)
+
+
+# ---- generating, searching -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One set to search."""
+
+    seed: int
+    kind: str | None  # None: the seed draws one
+    sets: Path
+    keep: bool = True  # the recordings, for a second time
+    nulls_count: int = 200
+    options: tuple[tuple[str, Any], ...] = ()  # further arguments of `find`
+
+
+@dataclass(frozen=True, slots=True)
+class Searched:
+    """What the workflow said of one set, in the truth's words, beside the truth."""
+
+    seed: int
+    truth: dict[str, Any] | None  # None where not even the generator came to an end
+    findings: dict[str, Any]
+    held_count: int
+    reducible: tuple[float, float]  # on held-out runs, before and after
+    reducible_sd: float  # standard error of the floor there, in the same unit
+    took_s: float
+    error: str = ""
+
+
+NOTHING: dict[str, Any] = {"verdict": "nothing", "effects": [], "parameter_errors": [], "not_excited": []}
+
+
+def sets_folder() -> Path:
+    """Return where sets are kept: a folder for this version of the generator."""
+    sources = sorted(Path(generate.__file__).parent.glob("*.py"))
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
+    return Path(tempfile.gettempdir()) / f"stagectl-blind-{os.getuid()}-{digest}"
+
+
+def generated(job: Job) -> tuple[Path, dict[str, Any]]:
+    """Return the folder of a set and its truth, which lies elsewhere; both are made where they are absent."""
+    name = f"{job.seed}-{job.kind or 'drawn'}"
+    folder, sealed = job.sets / "sets" / name, job.sets / "truths" / f"{name}.json"
+    if not (folder / "modeller.toml").exists() or not sealed.exists():  # modeller.toml is written last
+        case = generate.draw(job.seed, job.kind, DURATION_S)
+        truth = json.dumps(generate.truth(case))
+        generate.write(case, folder)
+        sealed.parent.mkdir(parents=True, exist_ok=True)
+        sealed.with_suffix(f".{os.getpid()}").write_text(truth)
+        sealed.with_suffix(f".{os.getpid()}").replace(sealed)
+    return folder, json.loads(sealed.read_text())
+
+
+def search(job: Job) -> Searched:
+    """Generate, read and search one set; an error of the workflow is a result, and counts as wrong."""
+    truth = None
+    begin_s = time.monotonic()
+    try:
+        folder, truth = generated(job)
+        blind = load_set(folder)
+        apart = held_out(blind)
+        training = [log for k, log in enumerate(blind.logs) if k not in apart]
+        held = [blind.logs[k] for k in apart]
+        begin_s = time.monotonic()
+        findings = find(blind.believed, training, held, nulls_count=job.nulls_count, **dict(job.options))
+        took_s = time.monotonic() - begin_s
+        if not job.keep:
+            for path in folder.iterdir():
+                path.unlink()
+        samples_count = sum(log.samples_count for log in held or training) * (1 if blind.believed.micro is None else 2)
+        return Searched(
+            job.seed,
+            truth,
+            in_words_of_the_truth(findings, blind.starts_s),
+            len(held),
+            (findings.reducible_before[1], findings.reducible_after[1]),
+            float(np.sqrt(2.0 * samples_count)),  # of a sum of so many squares of unit variance
+            took_s,
+        )
+    except Exception as error:  # noqa: BLE001  whatever it is, the other sets go on and this one counts as wrong
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+        return Searched(job.seed, truth, NOTHING, 0, (0.0, 0.0), 0.0, time.monotonic() - begin_s, text)
+
+
+def searched(jobs: Sequence[Job], workers: int) -> Iterator[Searched]:
+    """Search sets, each in a process of its own pool, in the order in which they end."""
+    if workers <= 1:
+        yield from map(search, jobs)
+        return
+    for name in _THREADS:  # heard by the workers: they must not fight for the processors
+        os.environ.setdefault(name, str(max(1, (os.cpu_count() or 1) // workers)))
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+        waiting = {pool.submit(search, job): job for job in jobs}
+        for future in concurrent.futures.as_completed(waiting):
+            job = waiting[future]
+            try:
+                yield future.result()
+            except concurrent.futures.process.BrokenProcessPool as error:
+                yield Searched(job.seed, None, NOTHING, 0, (0.0, 0.0), 0.0, 0.0, f"the worker died: {error}")
+
+
+# ---- marking ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Marked:
+    """One set with its mark by the suite's bars."""
+
+    searched: Searched
+    mark: dict[str, Any]
+    label: str
+
+    @property
+    def right(self) -> bool | None:
+        """Whether it counts as right; None where no bar speaks of it."""
+        return self.mark["right"]
+
+
+def marked(one: Searched) -> Marked:
+    """Mark one set; an error is wrong wherever a bar speaks of the set."""
+    if one.truth is None:
+        mark = {"seed": one.seed, "category": None, "right": False, "why": one.error, "pairs": [], "named": []}
+        return Marked(one, mark, "error")
+    mark = score.score(one.findings, one.truth)
+    if one.error:
+        mark |= {"right": False, "why": one.error, "pairs": [], "named": []}
+    return Marked(one, mark, _label(one, mark))
+
+
+def _label(one: Searched, mark: dict[str, Any]) -> str:
+    """Say in a word what kind of right or wrong it is."""
+    named, verdict = mark["named"], one.findings["verdict"]
+    if one.error:
+        return "error"
+    if mark["right"]:
+        return "right"
+    if mark["right"] is None:
+        return "unjudged"
+    if mark["category"] in ("null", "below_limit"):
+        return "false"
+    if mark["category"] == "outside":
+        return "misnamed" if named else "missed"
+    if mark["category"] == "parameter":
+        return "false" if named else "wrong parameter" if one.findings["parameter_errors"] else "missed"
+    if not named:
+        return "unknown" if verdict == "unknown" else "missed"
+    pairs, members = mark["pairs"], (one.truth or {})["effects"]
+    loose = score.matched(named, members, judged_aliases=False)
+    if len(loose) > len(pairs):
+        return "set too wide"
+    if len(pairs) == len(members):
+        return "extra name"
+    return "partly" if len(pairs) == len(named) else "confused"
+
+
+def line(one: Marked) -> str:
+    """Write one set as one line."""
+    done, truth = one.searched, one.searched.truth
+    head = f"{done.seed:>7} {truth['kind'] if truth else '?':<9}"
+    if truth is None:
+        return f"{head} {one.label.upper()}: {done.error}"
+    hidden = "; ".join(_member(member) for member in [*truth["effects"], *truth["parameter_errors"]]) or "nothing"
+    if done.error:
+        return f"{head} {hidden} => ERROR {done.error}  {done.took_s:.1f} s"
+    said = [_named(effect) for effect in done.findings["effects"]]
+    said += [f"PAR {_named(wrong)}" for wrong in done.findings["parameter_errors"]]
+    errors = [
+        f"{100 * error:.2g} %{'' if covered is None else ' in' if covered else ' OUT'}"
+        for error, covered in score.parameter_marks(one.mark["pairs"])
+    ]
+    parts = [f"{head} {hidden} => {done.findings['verdict']}", "; ".join(said) or "-"]
+    parts += [f"off by {', '.join(errors)}"] if errors else []
+    parts += [f"{one.mark['category'] or 'no bar'}: {one.label.upper() if one.right is False else one.label}"]
+    return " | ".join(parts) + f"  {done.took_s:.1f} s"
+
+
+def _member(member: dict[str, Any]) -> str:
+    text = f"{member['name']}@{member['acts_on']} d' {member['d_prime']:.3g}"
+    text += "" if member["above_twice_limit"] else " (below)"
+    inseparable = [f"{name}@{place}" for name, place in member["inseparable"]]
+    return text + (f" ~{{{', '.join(inseparable)}}}" if inseparable else "")
+
+
+def _named(found: dict[str, Any]) -> str:
+    aliases = [f"{name}@{place}" for name, place in found["alias_set"]]
+    return f"{found['name']}@{found['acts_on']}" + (f" +{{{', '.join(aliases)}}}" if aliases else "")
+
+
+def summary_lines(all_marked: Sequence[Marked]) -> list[str]:
+    """Write the bars, then precision and recall effect by effect."""
+    judged = [one for one in all_marked if one.searched.truth is not None]
+    result = score.summary([one.mark for one in judged], [one.searched.truth for one in judged])
+    lines = []
+    for row in result["figures"]:
+        share = "-" if row["value"] is None else f"{100 * row['value']:5.1f} %"
+        low, high = row["interval"]
+        verdict = {True: "", False: "MISSED", None: ""}[row["point_holds"]]
+        lines.append(
+            f"{row['figure']:<12} {row['right']:>3}/{row['count']:<3} {share} "
+            f"({100 * low:.0f} to {100 * high:.0f} %), bar {100 * row['bar']:.0f} % {verdict}"
+        )
+    for name in ("parameter_error_median", "coverage", "mean_set_size", "mean_own_set_size"):
+        if result[name] is not None:
+            lines.append(f"{name.replace('_', ' ')}: {result[name]:.3g}")
+    lines.append(f"reducible gap closed: {closed_text(all_marked)}")
+    for name, row in result["by_name"].items():
+        lines.append(
+            f"  {name:<36} named {row['named']:>3}, rightly {row['rightly']:>3}; "
+            f"hidden {row['hidden']:>3}, found {row['hidden_and_found']:>3}"
+        )
+    errors = [one for one in all_marked if one.searched.error]
+    if errors:
+        lines.append(f"{len(errors)} sets ended in an error: {', '.join(str(one.searched.seed) for one in errors)}")
+    labels = sorted({one.label for one in all_marked})
+    lines.append(", ".join(f"{label} {sum(one.label == label for one in all_marked)}" for label in labels))
+    return lines
+
+
+def closed_text(all_marked: Iterable[Marked]) -> str:
+    """Say how much of the reducible gap is closed, over all sets with an effect above twice its limit."""
+    reducible = [one.searched.reducible for one in all_marked if one.mark["category"] in ("single", "multi")]
+    before, after = sum(pair[0] for pair in reducible), sum(pair[1] for pair in reducible)
+    return f"{100 * (1 - after / before):.1f} % on {len(reducible)} sets" if before > 0.0 else "-"
+
+
+# ---- command line ----------------------------------------------------------------------------------------------------
+
+
+def seeds_of(text: str) -> list[int]:
+    """Read `100-140,150` as seeds."""
+    seeds: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        seeds += range(int(first), int(last or first) + 1)
+    return seeds
+
+
+def main(arguments: list[str] | None = None, say: Callable[[str], None] = print) -> int:
+    """Search sets of development seeds and say how each was marked."""
+    parser = argparse.ArgumentParser(prog="python -m bench.blind_sets", description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--seeds", type=seeds_of, required=True, help="such as 100-140,150; below 10000")
+    parser.add_argument("--kind", choices=("null", "single", "multi", "outside", "parameter"))
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--nulls", type=int, default=200, help="of the ranking stage")
+    parser.add_argument("--sets", type=Path, default=sets_folder(), help="where sets are kept")
+    parser.add_argument("--generate-only", action="store_true", help="make the sets, search nothing")
+    parser.add_argument("--json", type=Path, help="write findings, truths and marks to this file")
+    given = parser.parse_args(arguments)
+    if max(given.seeds) > generate.DEVELOPMENT_SEEDS[1]:
+        parser.error(f"seed {max(given.seeds)} is no development seed; those end at {generate.DEVELOPMENT_SEEDS[1]}")
+    jobs = [Job(seed, given.kind, given.sets, nulls_count=given.nulls) for seed in given.seeds]
+    if given.generate_only:
+        with multiprocessing.get_context("spawn").Pool(given.workers) as pool:
+            for folder, _ in pool.imap_unordered(generated, jobs):
+                say(str(folder))
+        return 0
+    all_marked = []
+    for one in searched(jobs, given.workers):
+        all_marked.append(marked(one))
+        say(line(all_marked[-1]))
+        sys.stdout.flush()
+    say("")
+    for text in summary_lines(all_marked):
+        say(text)
+    if given.json:
+        given.json.write_text(json.dumps([_plain(one) for one in sorted(all_marked, key=_seed)], indent=1))
+    return 0
+
+
+def _seed(one: Marked) -> int:
+    return one.searched.seed
+
+
+def _plain(one: Marked) -> dict[str, Any]:
+    done = one.searched
+    return {
+        "seed": done.seed,
+        "label": one.label,
+        "right": one.right,
+        "category": one.mark["category"],
+        "why": one.mark["why"],
+        "truth": done.truth,
+        "findings": done.findings,
+        "reducible": done.reducible,
+        "took_s": done.took_s,
+        "error": done.error,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())
