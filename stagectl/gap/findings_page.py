@@ -189,6 +189,8 @@ def _gap_table(findings: Findings) -> Table:
         "What is above the floor, in squares of the noise; 0 is the floor itself. Before: known parameters refitted, "
         "nothing named. On held-out runs every structural value is the one that the training runs gave."
     )
+    if findings.unknown is not None:
+        note += " After: with what would explain a part, though it is not stated as a name."
     return Table("Reducible gap", ["", "before", "after", "closed"], rows, note)
 
 
