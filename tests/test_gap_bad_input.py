@@ -112,14 +112,13 @@ def test_bad_recordings_of_one_axis_are_refused(case, axis_tables, tmp_path, cap
     assert any(part in message for part in said.split("|")), message
 
 
-def test_a_small_motion_in_mm_is_suspected_by_its_factor(tmp_path, capsys):
+def test_the_one_recording_in_mm_is_named_by_its_factor(tmp_path, capsys):
     tables = [axis_table(seed, amplitude_m=2e-4) for seed in (1, 2)]
-    runs = [
-        brought_in(with_columns(table, position=table["position"] * 1e3), f"run-{k}", tmp_path, AXIS_MAP)
-        for k, table in enumerate(tables)
-    ]
+    tables[1] = with_columns(tables[1], position=tables[1]["position"] * 1e3)
+    runs = [brought_in(table, f"run-{k}", tmp_path, AXIS_MAP) for k, table in enumerate(tables)]
     code, message = refused(capsys, profile_file(tmp_path), runs[:1], runs[1:], tmp_path)
     assert code == 2
+    assert "run-1: the macro accelerates" in message
     assert "positions in mm" in message
 
 
