@@ -152,7 +152,7 @@ def _grouped(value: float) -> str:
     """Round to three digits, thousands apart."""
     if not abs(value) >= 1e4:
         return rounded(value, 3)
-    return f"{float(f'{value:.2e}'):,.0f}".replace(",", "\u2009").replace("-", "\u2212")
+    return f"{float(f'{value:.2e}'):,.0f}".replace(",", "\u202f").replace("-", "\u2212")
 
 
 def _parameter_table(errors: Sequence[ParameterError]) -> Table:
