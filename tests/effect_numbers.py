@@ -59,8 +59,10 @@ WORKED: dict[str, list[Case]] = {
     "cable_spring": [Case((0.3, 2.0, 0.05), -0.5), Case((-0.2, 2.0, 0.05), 0.5)],
     # 1 mm of 4 mm: from nothing to a quarter; from 0.9 it slips at 1
     "cable_hysteresis": [
-        Case((0.1, 1e-2, 8.0, 4e-3), -1.0, (0.0,), (0.25,)),
-        Case((0.1, 1e-2, 8.0, 4e-3), -7.6, (0.9,), (1.0,)),
+        Case((0.1, 1e-2, 8.0, 4e-3, 0.0), -1.0, (0.0,), (0.25,)),
+        Case((0.1, 1e-2, 8.0, 4e-3, 0.0), -7.6, (0.9,), (1.0,)),
+        # p = 1/2: the square of 1 - 1/8 is left
+        Case((0.1, 1e-2, 8.0, 4e-3, 0.5), -0.9375, (0.0,), (0.234375,)),
     ],
     "linear_stiffness": [Case((2e-3, 500.0), -1.0), Case((-1e-3, -500.0), -0.5)],
     "cubic_stiffness": [Case((1e-3, 1e9), -1.0), Case((-2e-3, 1e9), 8.0)],
@@ -165,7 +167,7 @@ PARAMETERS: dict[str, tuple[float, ...]] = {  # some plausible values, in the or
     "offset": (0.4,),
     "gravity_tilt": (1e-3,),
     "cable_spring": (2.0, 0.05),
-    "cable_hysteresis": (3.0, 4e-3),
+    "cable_hysteresis": (3.0, 4e-3, 0.0),
     "linear_stiffness": (40.0,),
     "cubic_stiffness": (1e9,),
     "position_dependent_friction": (5.0, 1e-3),

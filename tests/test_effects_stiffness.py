@@ -27,7 +27,7 @@ def test_a_cable_that_slips_takes_four_times_its_force_times_the_way_less_a_slip
     angle = 2.0 * math.pi * (np.arange(2 * rows) + 0.5) / rows
     velocity = 0.02 * 2.0 * math.pi * np.cos(angle)  # one lap a second
     quantities = {"velocity_m_per_s": velocity, "dt_s": np.full(2 * rows, 1.0 / rows)}
-    power = along("cable_hysteresis", (3.0, 4e-3), quantities) * velocity
+    power = along("cable_hysteresis", (3.0, 4e-3, 0.0), quantities) * velocity
     assert math.isclose(np.sum(power[rows:]) / rows, -0.192, rel_tol=1e-4)
 
 

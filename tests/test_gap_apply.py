@@ -75,7 +75,7 @@ def _findings(path: Path, **changes) -> Findings:
         unknown=None,
         reducible_before=(1.0, 1.0),
         reducible_after=(0.0, 0.0),
-        thresholds=(10.0, 10.0),
+        threshold=10.0,
     )
     return dataclasses.replace(plain, **changes)
 

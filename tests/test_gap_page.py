@@ -32,7 +32,7 @@ def _findings(**fields) -> Findings:
         unknown=None,
         reducible_before=(0.0, 0.0),
         reducible_after=(0.0, 0.0),
-        thresholds=(16.0, 16.0),
+        threshold=16.0,
     )
     return dataclasses.replace(empty, **fields)
 

@@ -51,17 +51,22 @@ def cable_spring(position_m, stiffness_n_per_m, anchor_m):
     memory=1,
     level_n=(0.0, 1e3),
     slip_m=(1e-5, 0.5),
+    exponent_ratio=(0.0, 0.999),
     linear=("level_n",),
     symptom="a spring over the first millimetres after each reversal, then a constant drag",
-    reference="Al-Bender, Lampaert, Swevers, IEEE Trans. Automatic Control 50(11), 2005: one Maxwell-slip element",
+    reference="Dahl, A Solid Friction Model, Aerospace Corp. TOR-0158, 1968; with p = 0 one Maxwell-slip element",
 )
-def cable_hysteresis(velocity_m_per_s, dt_s, level_n, slip_m, memory):
-    """Hysteresis of a cable, a spring that slips: F = -F_s z / delta, z follows x and is held within +-delta.
+def cable_hysteresis(velocity_m_per_s, dt_s, level_n, slip_m, exponent_ratio, memory):
+    """Hysteresis of a cable, a spring that gives way: F = -F_s z, dz/dx = (1 - z sgn v)^p / delta, |z| <= 1.
 
-    memory: z / delta. Its step is exact for constant v, but for the part of a substep in which it begins to slip.
+    p = 0 slips all at once, p near 1 rounds the loop off as Dahl's. memory: z. Its step is exact for constant v, but
+    for the part of a substep in which it begins to slip.
     """
     z = memory[0]
-    memory[0] = min(max(z + velocity_m_per_s * dt_s / slip_m, -1.0), 1.0)
+    side = 1.0 if velocity_m_per_s >= 0.0 else -1.0
+    power = 1.0 - exponent_ratio
+    left = np.power(1.0 - side * z, power) - power * abs(velocity_m_per_s) * dt_s / slip_m
+    memory[0] = side * (1.0 - np.power(max(left, 0.0), 1.0 / power))
     return -0.5 * level_n * (z + memory[0])
 
 

@@ -22,6 +22,7 @@ AXES = ("macro", "end")
 
 _SETTLE_S = 0.3  # the filter forgets how it began
 _LOOSE_N = 1e3
+_READING_PASSES = 2
 
 
 @dataclass(slots=True)
@@ -303,10 +304,14 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
         + (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * h,
         "dt_s": h / PARTS_COUNT * whole,
     }
-    if kind == "sensor":  # a reading is of the sample's instant, which begins its interval
-        position_m = recording.position_m(axis)[:, None] * whole
-        velocity = np.gradient(motion.position_m.mean(axis=1), h)
-        known |= {"position_m": position_m, "velocity_m_per_s": _at_samples(motion.velocity_m_per_s, velocity)}
+    if kind == "sensor":  # a reading is of the sample's instant: one column, where all else has parts of intervals
+        known = {name: _at_samples(values) for name, values in known.items()}
+        known |= {
+            "position_m": recording.position_m(axis)[:, None],
+            "t_s": (recording.log.start_s + recording.log.times_s)[:, None],
+            "dt_s": np.full((recording.log.samples_count, 1), h),
+        }
+        return known
     joint = recording.believed.joint
     if joint is not None and recording.side is not None:
         known["penetration_m"] = recording.penetration_m
@@ -345,7 +350,7 @@ def operating_point(recording: Recording, moved: Sequence[tuple[Effect, str, dic
         axis = "macro" if place.startswith("macro") else "end"
         known = quantities(recording, axis, place)
         if place.endswith("_sensor"):
-            error_m = along_motion(effect, [known[name] for name in effect.quantities], parameters)[:, 0]
+            error_m = reading_error_m(recording, effect, place, parameters, True)[:, 0]
             if axis == "macro":
                 log = replace(log, macro_position_m=log.macro_position_m - error_m)
             else:
@@ -363,14 +368,10 @@ def operating_point(recording: Recording, moved: Sequence[tuple[Effect, str, dic
     return recording_of(log, believed)
 
 
-def _at_samples(fine: np.ndarray, fallback: np.ndarray) -> np.ndarray:
-    """Bring values at middles of parts back to the instants that begin the intervals."""
-    flat = fine.ravel()
-    parts = fine.shape[1]
-    starts = np.empty(fine.shape[0])
-    starts[1:] = 0.5 * (flat[parts::parts] + flat[parts - 1 : -1 : parts])
-    starts[0] = flat[0] if np.isfinite(flat[0]) else fallback[0]
-    return starts[:, None] * np.ones((1, parts))
+def _at_samples(fine: np.ndarray) -> np.ndarray:
+    """Bring values at middles of parts back to the instants that begin the intervals, shape (n, 1)."""
+    ends = np.concatenate([fine[:1, 0], 0.5 * (fine[1:, 0] + fine[:-1, -1])])
+    return ends[:, None]
 
 
 def effect_forces(
@@ -383,14 +384,14 @@ def effect_forces(
     """
     axis = "macro" if place.startswith("macro") else "end"
     known = quantities(recording, axis, place)
+    if place.endswith("_sensor"):
+        return _misread(recording, axis, reading_error_m(recording, effect, place, parameters, whole), whole)
     value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
     if place in ("contact", "joint"):
         push_n = value if place == "joint" else recording.side * value if recording.side is not None else 0.0 * value
         return Forces(macro_n=-push_n, end_n=push_n)
     if place == "contact_edge":
         return _edges_moved(recording, effect, parameters, value, whole)
-    if place.endswith("_sensor"):
-        return _misread(recording, axis, value, whole)
     if place.endswith("_command"):
         belief = recording.belief(axis)
         return motor_forces(
@@ -402,6 +403,26 @@ def effect_forces(
     if place.endswith("_actuator"):
         return motor_forces(recording, axis, value, None)
     return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
+
+
+def reading_error_m(
+    recording: Recording, effect: Effect, place: str, parameters: list[float], whole: bool
+) -> np.ndarray:
+    """Return what a sensor effect adds to the readings, shape (n, 1); `whole`: along the motion without the error.
+
+    A delay T taken along the delayed motion is off by a T^2, which is what tells it from a lag.
+    """
+    known = quantities(recording, "macro" if place.startswith("macro") else "end", place)
+    error_m = along_motion(effect, [known[name] for name in effect.quantities], parameters)
+    if not whole:
+        return error_m
+    for _ in range(_READING_PASSES):
+        true = known | {
+            "position_m": known["position_m"] - error_m,
+            "velocity_m_per_s": known["velocity_m_per_s"] - np.gradient(error_m, recording.log.period_s, axis=0),
+        }
+        error_m = along_motion(effect, [true[name] for name in effect.quantities], parameters)
+    return error_m
 
 
 def motor_forces(recording: Recording, axis: str, force_n: np.ndarray, current_a: np.ndarray | None) -> Forces:
@@ -443,8 +464,8 @@ def _misread(recording: Recording, axis: str, error_m: np.ndarray, whole: bool) 
         return forces
     away_m = error_m if axis == "end" else -error_m  # by which end minus macro is read too large
     if whole:
-        fine_m = _between_samples(sampled_m if axis == "end" else -sampled_m, error_m.shape[1])
-        slope = np.gradient(fine_m.ravel(), recording.log.period_s / error_m.shape[1]).reshape(error_m.shape)
+        fine_m = _between_samples(sampled_m if axis == "end" else -sampled_m, PARTS_COUNT)
+        slope = np.gradient(fine_m.ravel(), recording.log.period_s / PARTS_COUNT).reshape(fine_m.shape)
         x_b = recording.macro.position_m - end.position_m
         rate = recording.macro.velocity_m_per_s - end.velocity_m_per_s
         spring_n = joint.spring_n_per_m * fine_m + joint.damping_n_s_per_m * slope
@@ -453,7 +474,7 @@ def _misread(recording: Recording, axis: str, error_m: np.ndarray, whole: bool) 
     else:
         left = np.where(recording.side < 0.0, joint.left_stiffness_n_per_m, 0.0)
         right = np.where(recording.side > 0.0, joint.right_stiffness_n_per_m, 0.0)
-        forces.end_n = (joint.spring_n_per_m + left + right) * away_m
+        forces.end_n = (joint.spring_n_per_m + left + right) * _between_samples(away_m[:, 0], PARTS_COUNT)
     forces.macro_n = -forces.end_n
     return forces
 

@@ -82,14 +82,12 @@ def summary(residuals: Sequence[Residual]) -> list[dict[str, Any]]:
 
 def _facts(findings: Findings, seed: int) -> list[tuple[str, str]]:
     held = ", ".join(Path(run).name for run in findings.holdout) or "none apart: each training run is held out once"
-    first, second = findings.thresholds
     return [
         ("Profile", findings.profile),
         ("Training runs", ", ".join(Path(run).name for run in findings.runs)),
         ("Held-out runs", held),
         ("Seed", str(seed)),
-        ("Threshold of the gain, training", rounded(first, 3)),
-        ("Threshold of the gain, held-out", rounded(second, 3)),
+        ("Threshold of the gain", rounded(findings.threshold, 3)),
     ]
 
 

@@ -55,7 +55,9 @@ def grids_for(recordings: list[Recording]) -> Grid:
         "lugre_friction": [
             {"static_ratio": 1.5, "stribeck_m_per_s": v, "slip_m": s} for v in (3e-3, 1e-2) for s in (2e-6, 1e-5)
         ],
-        "cable_hysteresis": [{"slip_m": s} for s in (1e-3, 1e-2, 5e-2)],
+        "cable_hysteresis": [
+            {"slip_m": s, "exponent_ratio": p} for s in (2e-3, 6e-3, 2e-2, 6e-2) for p in (0.0, 0.999)
+        ],
         "cable_spring": [{"anchor_m": centre_m}],
         "contact_hysteresis": [{"smoothing_m_per_s": _SMOOTHING_M_PER_S}],
         "soft_contact": [{"knee_m": k} for k in (3e-6, 1e-5, 3e-5, 6e-5)],

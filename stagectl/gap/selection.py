@@ -6,7 +6,7 @@ best of the whole library gains on noise, and when it explains a share of what i
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -15,6 +15,9 @@ import numpy as np
 NULL_QUANTILE = 0.99
 MATERIAL_RATIO = 0.002
 """Share of everything gained so far that a further hypothesis must gain: below it, laws are not that exact."""
+
+SEARCH_PRICE = 2.0
+"""What a shape that is searched beyond the grid gains on noise, at most about (chi square of one number)."""
 
 RIVALS_COUNT = 6
 """Names whose shapes are searched in each round."""
@@ -143,7 +146,7 @@ class Judge:
     library: list[Group]
     refine: Refine
     gain_at_size: Callable[[Sequence[Group]], Callable[[Group], float]]
-    thresholds: tuple[float, float] = (0.0, 0.0)
+    threshold: float = 0.0
     trace: list[str] = field(default_factory=list)
     _known_rivals: dict[frozenset[tuple[int, ...]], list[Group]] = field(default_factory=dict)
 
@@ -179,37 +182,12 @@ class Judge:
         return solve([*self.base, *groups], self.source.sums).gain
 
     def calibrate(self) -> None:
-        """Set thresholds: the quantile of the best gains of the whole library on noise."""
-        best = np.zeros((2, self.training[0].nulls.shape[0]))
-        for _, trained, apart in self.additions([], on_noise=True):
-            best = np.maximum(best, [trained, apart])
-        self.thresholds = (float(np.quantile(best[0], NULL_QUANTILE)), float(np.quantile(best[1], NULL_QUANTILE)))
-
-    def additions(
-        self, chosen: Sequence[Group], on_noise: bool = False
-    ) -> Iterator[tuple[Group, np.ndarray, np.ndarray]]:
-        """Yield what each term of the library gains beside `chosen`, on training and on held-out recordings.
-
-        Shape (1,) each; with `on_noise` one element a draw of noise in the innovations' place. The same as `gains`
-        with and without the term, at the cost of one elimination a fold instead of one a term.
-        """
-        whole = _Fold([*self.base, *chosen], self.training, self.held or self.training, on_noise)
-        folds = [whole]
-        if not self.held and len(self.training) > 1:
-            folds = [
-                _Fold([*self.base, *chosen], self.training[:k] + self.training[k + 1 :], [self.training[k]], on_noise)
-                for k in range(len(self.training))
-            ]
-        taken = {group.key for group in chosen}
+        """Set the threshold: the quantile of the best gain of the whole library on noise."""
+        fold = _Fold(self.base, self.source.sums, self.source.sums, on_noise=True)
+        best = np.zeros(self.source.sums[0].nulls.shape[0])
         for group in self.library:
-            if group.key in taken:
-                continue
-            trained, apart = whole.added(group)
-            if folds[0] is not whole:
-                apart = sum((fold.added(group)[1] for fold in folds), np.zeros(1))
-            elif not self.held:
-                apart = trained
-            yield group, trained, apart
+            best = np.maximum(best, fold.added(group)[0])
+        self.threshold = float(np.quantile(best, NULL_QUANTILE))
 
     def reducible(self, groups: Sequence[Group]) -> tuple[float, float]:
         """Return what is left above the floor on training and held-out recordings, in squares of the noise."""
@@ -314,9 +292,9 @@ class Judge:
         least = MATERIAL_RATIO * (whole - self.gain([]))
         gained = whole - self.gain(chosen)
         return (
-            trained > self.thresholds[0]
+            trained > 0.0
             and apart > 0.0
-            and gained > max(sum(self.thresholds), least, self.price() * group.complexity)
+            and gained > max(self.threshold + SEARCH_PRICE * group.searched, least, self.price() * group.complexity)
         )
 
     def _without_superfluous(self, chosen: list[Group]) -> list[Group]:

@@ -73,7 +73,7 @@ class Findings:
     unknown: dict[str, Any] | None
     reducible_before: tuple[float, float]
     reducible_after: tuple[float, float]
-    thresholds: tuple[float, float]
+    threshold: float
     remarks: tuple[str, ...] = ()
     trace: tuple[str, ...] = field(default=())
 
@@ -114,7 +114,7 @@ def find(
             [balance.operating_point(r, moved) for r in recordings], len(training),
             seed=seed, without=without, moved=moved, kept=kept,
         )  # fmt: skip
-        last.judge.thresholds = judge.thresholds
+        last.judge.threshold = judge.threshold
         last.judge.trace = judge.trace
         chosen = last.judge.select(last.kept)
         named = _remeasured(last, chosen, named, moved) + _all_named(last, chosen)
@@ -137,7 +137,7 @@ def find(
         unknown=unknown,
         reducible_before=before,
         reducible_after=after,
-        thresholds=judge.thresholds,
+        threshold=judge.threshold,
         remarks=tuple(remark for log in logs for remark in log.remarks),
         trace=tuple(judge.trace),
     )
@@ -403,7 +403,7 @@ def _unknown(search: Competition, chosen: list[Group], before_excess: float) -> 
             best, gained = curve, gain
     judge.trace.append(f"left over {left:.0f} of {first:.0f}, noise {noise:.0f}, best curve {gained:.0f}")
     floor = _LEFT_SDS * noise + _LEFT_SHARE * max(first, 0.0)
-    material = best is not None and gained > max(3.0 * sum(judge.thresholds), _CURVE_SHARE * max(first, 0.0))
+    material = best is not None and gained > max(3.0 * judge.threshold, _CURVE_SHARE * max(first, 0.0))
     if not left > floor and not material:
         return None
     found: dict[str, Any] = {"left": left, "before": first, "gain": gained}
