@@ -108,7 +108,7 @@ def _interval(change: Change) -> str:
 
 
 def _log(run: str, runs_root: Path, believed: Believed) -> Log:
-    return read_log(folder_of(run, runs_root), believed.period_s)
+    return read_log(folder_of(run, runs_root), believed.period_s, believed)
 
 
 def _named(findings: Findings) -> Table:
