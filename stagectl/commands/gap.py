@@ -16,13 +16,11 @@ from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import addition, arbiter
 from stagectl.gap.application import Application, Change, application
 from stagectl.gap.believed import Believed, document_of, load_believed
-from stagectl.gap.findings_file import read_findings, write_findings
+from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import Log, constant_columns, read_log
 from stagectl.gap.workflow import Findings, Named, find
 from stagectl.profile import Profile, search_folders
 from stagectl.whole_file import replace_whole
-
-FINDINGS = "findings.json"
 
 
 def search(

@@ -11,6 +11,7 @@ import numpy as np
 
 from stagectl.gap import hypotheses, prediction
 from stagectl.gap.balance import channels, column
+from stagectl.gap.believed import Believed
 from stagectl.gap.grids import grids_for
 from stagectl.gap.moves import Move
 from stagectl.gap.planned import planned_log
@@ -118,14 +119,14 @@ def _distance(one: Expected, against: tuple[tuple[str, str], ...]) -> float:
     return min((d for name, place, d in one.separations if (name, place) in against), default=one.d_prime)
 
 
-def excitations(seen: Evidence, findings: Findings, moves: Sequence[Move]) -> list[tuple[str, str]]:
+def excitations(believed: Believed, findings: Findings, moves: Sequence[Move]) -> list[tuple[str, str]]:
     """Return (effect, move) for everything that the recordings did not excite: the move it shows most on."""
     wanted = set(findings.not_excited)
     if not wanted:
         return []
     best: dict[str, tuple[float, str]] = {}
     for move in moves:
-        recording = seen.recording(planned_log(move.trajectory, seen.believed))
+        recording = prediction.prepared(planned_log(move.trajectory, believed), believed)
         if not sum(size for _, size in channels(recording)):
             continue
         for term in hypotheses.effect_terms([recording], grids_for([recording])):

@@ -11,7 +11,7 @@ phase of what repeats in position, where each homing has its own. Pure.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -111,17 +111,13 @@ class Evidence:
     rivals: dict[tuple[str, str], dict[tuple[str, str], _Model]]
     scatter: np.ndarray  # of each effect's share between recordings
 
-    def recording(self, log: Log) -> Recording:
-        """Prepare a log."""
-        return _prepared(log, self.believed)
-
 
 def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evidence:
     """Read findings and their recordings for prediction. Errors: RequestError where there is nothing to predict."""
     named = tuple(effect for effect in findings.named if not _per_run(effect))
     if not named:
         raise RequestError("these findings name no effect that could be predicted; `next` shows what to excite")
-    recordings = [_prepared(log, believed) for log in logs]
+    recordings = [prepared(log, believed) for log in logs]
     base = hypotheses.parameter_terms(recordings[0])
     base_values = np.array([findings.refitted.get(term.name, 0.0) for term, _ in base])
 
@@ -158,7 +154,7 @@ def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evi
 
 def expected(seen: Evidence, log: Log) -> list[Expected]:
     """Say what each effect will do on a planned motion, one a named effect in their order."""
-    recording = seen.recording(log)
+    recording = prepared(log, seen.believed)
     nothing = np.zeros(sum(size for _, size in balance.channels(recording)))
     raw = seen.model.columns(recording, nothing)
     d = _white(recording, raw, seen.filters)
@@ -190,7 +186,7 @@ def expected(seen: Evidence, log: Log) -> list[Expected]:
 
 def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Outcome]:
     """Judge predictions by a recording that nobody had seen: values as found, nothing refitted."""
-    recording = seen.recording(log)
+    recording = prepared(log, seen.believed)
     z = balance.observed(recording)
     raw = seen.model.columns(recording, z)
     d, zw = _white(recording, raw, seen.filters), _white(recording, z, seen.filters)
@@ -221,7 +217,8 @@ def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Ou
     return outcomes
 
 
-def _prepared(log: Log, believed: Believed) -> Recording:
+def prepared(log: Log, believed: Believed) -> Recording:
+    """Prepare a log with the noise that the search begins with."""
     recording = balance.recording_of(log, believed)
     balance.set_noise(recording, first_noise(believed, recording))
     return recording
@@ -442,3 +439,18 @@ def _separation(
     inner = np.linalg.inv(seen.model.covariance[:first, :first]) + base.T @ base
     along = base.T @ apart
     return float(np.sqrt(max(float(apart @ apart - along @ np.linalg.solve(inner, along)), 0.0)))
+
+
+def with_outcomes(findings: Findings, outcomes: Sequence[Outcome]) -> Findings:
+    """Return findings in which what held is confirmed, without the aliases that the run ruled out."""
+    by_key = {(one.name, one.acts_on): one for one in outcomes}
+    named = []
+    for effect in findings.named:
+        outcome = by_key.get((effect.name, effect.acts_on))
+        if outcome is None:
+            named.append(effect)
+            continue
+        out = {(name, place) for name, place, _ in outcome.out}
+        aliases = tuple(alias for alias in effect.aliases if alias[:2] not in out)
+        named.append(replace(effect, confirmed=outcome.confirmed, aliases=aliases))
+    return replace(findings, named=tuple(named))
