@@ -28,7 +28,7 @@ from stagectl.profile import Profile, load_profile, search_folders
 from stagectl.record import read_run
 from stagectl.report import Quantity, Report
 from stagectl.run_folder import reserve
-from stagectl.run_scores import write_truth
+from stagectl.run_scores import read_truth, write_truth
 from stagectl.scoring import score
 from stagectl.stage import open_stage
 from stagectl.supervisor import Supervisor
@@ -79,8 +79,10 @@ class _Rig:
             done = stage.run(move.trajectory, self.profile.control.law) if armed.finished else armed
             if not done.finished:
                 raise DriveError(f"gap demo, {move.name}: {done.text}")
-            truth = stage.backend.truth()
         run = read_run(stage.folder)
+        truth = read_truth(stage.folder)
+        if truth is None:
+            raise DriveError(f"gap demo, {move.name}: the rig kept no truth; nothing can be scored")
         scored = score(run, truth, done.first_row, done.rows)
         return stage.folder, float(np.sqrt(np.nanmean(scored.true_mean_error_m**2)))
 

@@ -75,9 +75,7 @@ def show(
     return Answer({**data, "run": str(folder), "judged": judged}, shown)
 
 
-def perform(
-    seen: Evidence, chosen: Proposal, profile: Profile, stage: Stage
-) -> tuple[list[Outcome], Path, str]:
+def perform(seen: Evidence, chosen: Proposal, profile: Profile, stage: Stage) -> tuple[list[Outcome], Path, str]:
     """Do the move that was chosen and judge what was predicted of it; a text where it did not come to its end."""
     with stage() as connected:
         folder = connected.folder
@@ -148,7 +146,9 @@ def _plain(one: Proposal) -> dict:
 
 
 def _proposed(proposals: Sequence[Proposal]) -> list:
-    table = Table("effect", "next move", "takes", "to tell it from", "d'", "gap before", "after", "fall, 95 %", box=None)
+    table = Table(
+        "effect", "next move", "takes", "to tell it from", "d'", "gap before", "after", "fall, 95 %", box=None
+    )
     remarks = []
     for one in proposals:
         mine = next(e for e in one.expected if (e.name, e.acts_on) == (one.name, one.acts_on))
@@ -161,7 +161,7 @@ def _proposed(proposals: Sequence[Proposal]) -> list:
             f"{one.d_prime:.1f}",
             _size(mine.gap_before, mine.unit),
             _size(mine.gap_after, mine.unit),
-            f"{low:.0f} .. {high:.0f}",
+            f"{_size(low, mine.unit)} .. {_size(high, mine.unit)}",
         )
         if one.never_apart:
             names = ", ".join(f"{name} on {where}" for name, where in one.never_apart)
@@ -180,8 +180,8 @@ def judged_table(outcomes: Sequence[Outcome], expected: Sequence[Expected]) -> T
             f"{one.name} on {one.acts_on}",
             _size(one.gap_before, one.unit),
             _size(one.gap_after, one.unit),
-            f"{one.fall:.0f}",
-            f"{low:.0f} .. {high:.0f}",
+            _size(one.fall, one.unit),
+            f"{_size(low, one.unit)} .. {_size(high, one.unit)}",
             "confirmed" if one.confirmed else "candidate",
         )
     return table

@@ -7,10 +7,7 @@ import numpy as np
 import tomlkit
 
 _DRAWN: dict[bool, tuple[tuple[str, str, dict[str, tuple[float, float]]], ...]] = {
-    True: (
-        ("coulomb_friction", "micro_force", {"level_n": (0.3, 0.8), "smoothing_m_per_s": (1e-4, 1e-4)}),
-        ("coulomb_friction", "micro_force", {"level_n": (0.8, 1.5), "smoothing_m_per_s": (1e-4, 1e-4)}),
-    ),
+    True: (("coulomb_friction", "micro_force", {"level_n": (0.3, 1.5), "smoothing_m_per_s": (1e-4, 1e-4)}),),
     False: (
         ("coulomb_friction", "macro_force", {"level_n": (2.0, 6.0), "smoothing_m_per_s": (1e-4, 1e-4)}),
         (

@@ -1,5 +1,6 @@
 """The moves that `stagectl gap next` chooses from: a declared library, each within what the stage may do. Pure."""
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ import numpy as np
 from stagectl import trajectory as trajectories
 from stagectl.errors import RequestError
 from stagectl.signals import SETPOINT
-from stagectl.touch_sweep import IDENTIFY_HZ, IDENTIFY_SHARE, Joint, contact_damping_n_s_per_m, plan
+from stagectl.touch_sweep import IDENTIFY_HZ, IDENTIFY_SHARE, Joint, TouchSweep, contact_damping_n_s_per_m, plan
 from stagectl.trajectory import Limits, Trajectory
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class Room:
     high_m: float
     limits: Limits
     period_s: float
-    touch: tuple[float, float, float] | None = None  # amplitude, frequency, duration of a sweep over both edges
+    touch: TouchSweep | None = None  # over both edges of the joint
 
     @property
     def middle_m(self) -> float:
@@ -72,7 +73,7 @@ def room_of(profile: "Profile") -> Room:
             contact_damping_n_s_per_m(profile.effects),
             b.touch_force_n,
         )
-        touch = tuple(plan(joint, IDENTIFY_SHARE, IDENTIFY_HZ, _MOVE_S))
+        touch = plan(joint, IDENTIFY_SHARE, IDENTIFY_HZ, _MOVE_S)
     return Room(*macro.travel_m, limits, profile.cycle.period_s, touch)
 
 
@@ -149,7 +150,7 @@ def _staircase(room: Room) -> Trajectory:
     places_m = room.middle_m + room.reach_m * np.linspace(-0.5, 0.5, _PLACES_COUNT)
     order = [0, 2, 4, 3, 1, 0]
     parts: list[np.ndarray] = []
-    for here, there in zip(order, order[1:], strict=False):
+    for here, there in itertools.pairwise(order):
         parts.append(_rest(float(places_m[here]), _HOLD_S, room.period_s))
         moved = trajectories.move(float(places_m[here]), float(places_m[there]), room.limits, room.period_s)
         parts.append(moved.setpoints)

@@ -18,7 +18,7 @@ def planned_log(planned: Trajectory, believed: Believed) -> Log:
     zeros = np.zeros(end_m.size)
     valid = np.ones(end_m.size, bool)
     joint = believed.joint
-    acceleration = rows["acceleration_m_per_s2"].astype(float)
+    acceleration = _means(rows["acceleration_m_per_s2"])
     if believed.micro is None or joint is None:
         still = Log(planned.name, planned.dt_s, end_m, zeros, valid, "planned", reference_m=end_m)
         macro_n = believed.macro.mass_kg * acceleration - _others(still, believed).macro_n
@@ -31,9 +31,15 @@ def planned_log(planned: Trajectory, believed: Believed) -> Log:
     others = _others(still, believed)
     micro_n = believed.micro.mass_kg * acceleration - others.end_n
     reaction = sum(row["fraction_ratio"] for row in believed.effects if row["name"] == "micro_reaction")
-    macro_acceleration = acceleration - rows["relative_acceleration_m_per_s2"]
+    macro_acceleration = acceleration - _means(rows["relative_acceleration_m_per_s2"])
     macro_n = believed.macro.mass_kg * macro_acceleration - others.macro_n + reaction * micro_n
     return _with_commands(still, believed, macro_n, micro_n)
+
+
+def _means(values: np.ndarray) -> np.ndarray:
+    """Bring values at samples to means over the intervals that begin there."""
+    following = np.append(values[1:], values[-1:])
+    return 0.5 * (values + following)
 
 
 class _Others:

@@ -3,9 +3,10 @@
 A finding predicts by how much the gap falls when its effect is known: with whitened innovations z of a recording, B the
 known parameters at the values of the findings and s what the effect alone does to them,
 
-    fall = |z - B b|^2 - |z - B b - s|^2 = |s|^2 (2 a - 1),        a = s'(z - B b) / |s|^2
+    |z - B b|^2 - |z - B b - s|^2 = |s|^2 (2 a - 1),        a = s'(z - B b) / |s|^2
 
-a is 1 where the effect is there as found, 0 where it is not. Its spread comes from noise, from what the recordings of the
+a is 1 where the effect is there as found, 0 where it is not. In newtons the gap falls from a f to (1 - a) f, f being
+the rms of the force that was found, along the motion. The spread of a comes from noise, from what the recordings of the
 findings leave open in b and in the effect itself, and from how a scatters between them. Nothing is refitted but the
 phase of what repeats in position, where each homing has its own. Pure.
 """
@@ -41,6 +42,9 @@ SEPARATED = 9.0
 _MATERIAL_RATIO = 0.01
 """Share of an effect's own energy below which a margin may be the model's, not the name's."""
 
+_MOTION_RATIO = 0.01
+"""Standard deviation of an effect's size on a motion against that on the motion as planned."""
+
 _AR_ORDER = 12
 
 Columns = Callable[[Recording, np.ndarray], np.ndarray]
@@ -56,16 +60,17 @@ class Expected:
     unit: str
     gap_before: float
     gap_after: float  # what noise and uncertainty leave
-    fall: float  # of the sum of squares, in squares of the noise: twice the gain of log-likelihood
+    fall: float  # of the gap: the effect's own size where it is there as found
     fall_interval: tuple[float, float]
+    gain: float  # of log-likelihood, twice; of the motion as planned
     share_interval: tuple[float, float]  # of the effect as found; 1 is exactly as found
     d_prime: float
     separations: tuple[tuple[str, str, float], ...] = ()  # d' to each effect that explains the findings as well
 
     @property
     def decides(self) -> bool:
-        """Whether the outcome can tell the effect from nothing at all."""
-        return self.share_interval[0] > 0.0 and self.d_prime >= DETECTED
+        """Whether the outcome can tell the effect from nothing, and from one half of it."""
+        return self.share_interval[0] > 0.5 and self.d_prime >= DETECTED
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +83,7 @@ class Outcome:
     gap_before: float
     gap_after: float
     fall: float
+    gain: float
     share: float
     inside: bool
     better: tuple[tuple[str, str, float], ...]  # aliases that the recording prefers, by how much
@@ -109,6 +115,7 @@ class Evidence:
     filters: dict[str, tuple[np.ndarray, float]]  # autoregression of what is left, by channel
     model: _Model
     rivals: dict[tuple[str, str], dict[tuple[str, str], _Model]]
+    late_ratio: float  # share of samples that the recordings lack
     scatter: np.ndarray  # of each effect's share between recordings
 
 
@@ -121,11 +128,12 @@ def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evi
     base = hypotheses.parameter_terms(recordings[0])
     base_values = np.array([findings.refitted.get(term.name, 0.0) for term, _ in base])
 
-    known: dict[int, np.ndarray] = {}
+    known: list[tuple[Recording, np.ndarray]] = []
 
     def base_columns(recording: Recording) -> np.ndarray:
-        if id(recording) in known:  # of a recording that lives as long as these columns do
-            return known[id(recording)]
+        for other, block in known:
+            if other is recording:
+                return block
         return _stack(recording, [forces for term, _ in base for forces in term.forces(recording)])
 
     def columns(recording: Recording, rest: np.ndarray) -> np.ndarray:
@@ -136,24 +144,32 @@ def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evi
     values = np.concatenate([base_values, np.ones(len(named))])
     blocks = []
     for recording in recordings:
-        known[id(recording)] = base_columns(recording)
+        known.append((recording, base_columns(recording)))
         z = balance.observed(recording)
         blocks.append((recording, z, columns(recording, z)))
-    filters = _filters([(r, z - d @ values) for r, z, d in blocks])
     prior = np.array([1.0 / sd**2 for _, sd in base] + [0.0] * len(named))
+    wanted = {alias[:2] for one in named for alias in one.aliases}
+    terms = [term for term in hypotheses.effect_terms(recordings, grids_for(recordings)) if term.key in wanted]
+    filters = _filters(blocks, prior, terms)
     white = [(_white(r, z, filters), _white(r, d, filters)) for r, z, d in blocks]
     covariance = np.linalg.inv(sum((d.T @ d for _, d in white), np.diag(prior)))
     model = _Model(columns, values, covariance)
     scatter = _scatter(white, values, len(named))
+    late_ratio = float(np.mean([1.0 - log.valid.mean() for log in logs]))
     rivals = {
-        (one.name, one.acts_on): _rivals(one, named, base_columns, prior, base_values, recordings, blocks, filters)
+        (one.name, one.acts_on): _rivals(one, named, terms, base_columns, prior, base_values, blocks, filters)
         for one in named
     }
-    return Evidence(believed, named, base, base_values, filters, model, rivals, scatter)
+    return Evidence(believed, named, base, base_values, filters, model, rivals, late_ratio, scatter)
 
 
 def expected(seen: Evidence, log: Log) -> list[Expected]:
-    """Say what each effect will do on a planned motion, one a named effect in their order."""
+    """Say what each effect will do on a planned motion, one a named effect in their order.
+
+    Samples come late as often as in the recordings of the findings.
+    """
+    late = np.random.default_rng(0).random(log.samples_count) < seen.late_ratio
+    log = replace(log, valid=log.valid & ~late)
     recording = prepared(log, seen.believed)
     nothing = np.zeros(sum(size for _, size in balance.channels(recording)))
     raw = seen.model.columns(recording, nothing)
@@ -165,9 +181,10 @@ def expected(seen: Evidence, log: Log) -> list[Expected]:
         energy = float(s @ s)
         if not energy > 0.0:
             continue
-        unit, size = _size(recording, effect, raw[:, first + number])
+        unit, size = _size(recording, effect)
         sd = _share_sd(d, s, seen.model.covariance, float(seen.scatter[number]))
         low, high = 1.0 - SIGMAS * sd, 1.0 + SIGMAS * sd
+        spread = SIGMAS * size * float(np.hypot(2.0 * sd, _MOTION_RATIO))
         planned = raw[:, first + number] + raw[:, :first] @ seen.base_values
         separations = tuple(
             (*key, _separation(recording, seen, d[:, :first], s, rival, planned))
@@ -176,8 +193,8 @@ def expected(seen: Evidence, log: Log) -> list[Expected]:
         free = _free_energy(d, first + number, seen.model.covariance, first)
         found.append(
             Expected(
-                effect.name, effect.acts_on, unit, size, size * sd, energy,
-                (energy * (2.0 * low - 1.0), energy * (2.0 * high - 1.0)), (low, high), float(np.sqrt(free)),
+                effect.name, effect.acts_on, unit, size, size * sd, size,
+                (size - spread, size + spread), energy, (low, high), float(np.sqrt(free)),
                 separations,
             )
         )  # fmt: skip
@@ -199,17 +216,23 @@ def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Ou
         s = d[:, first + number]
         energy = float(s @ s)
         share = 1.0 + float(s @ whole) / energy if energy > 0.0 else 0.0
-        unit, size = _size(recording, seen.named[number], raw[:, first + number])
+        unit, size = _size(recording, seen.named[number])
+        fall = size * (2.0 * share - 1.0)
         margins = []
         for key, rival in seen.rivals[prediction.name, prediction.acts_on].items():
             other = _white(recording, rival.columns(recording, z), seen.filters)
             margins.append((*key, _surprise(zw - other @ rival.values, other, rival.covariance) - mine))
         low, high = prediction.share_interval
+        inside = (
+            prediction.decides
+            and low <= share <= high
+            and prediction.fall_interval[0] <= fall <= prediction.fall_interval[1]
+        )
         limit = max(SEPARATED, _MATERIAL_RATIO * energy)
         outcomes.append(
             Outcome(
                 prediction.name, prediction.acts_on, unit, size * abs(share), size * abs(1.0 - share),
-                energy * (2.0 * share - 1.0), share, bool(low <= share <= high),
+                fall, energy * (2.0 * share - 1.0), share, inside,
                 tuple(row for row in margins if row[2] < -limit),
                 tuple(row for row in margins if row[2] > limit),
             )
@@ -295,8 +318,24 @@ def _stack(recording: Recording, forces: Sequence[Forces]) -> np.ndarray:
     return np.column_stack([balance.column(recording, one) for one in forces])
 
 
-def _filters(rests: Sequence[tuple[Recording, np.ndarray]]) -> dict[str, tuple[np.ndarray, float]]:
-    """Fit an autoregression a channel to what the model leaves of all recordings (Yule-Walker)."""
+def _filters(
+    blocks: Sequence[tuple[Recording, np.ndarray, np.ndarray]], prior: np.ndarray, terms: Sequence[Term]
+) -> dict[str, tuple[np.ndarray, float]]:
+    """Fit an autoregression a channel (Yule-Walker) to what effects and aliases together leave of all recordings.
+
+    What only a wrong name leaves is no noise: taken for noise it would hide the right one.
+    """
+    wide = []
+    for recording, _, d in blocks:
+        more = [forces for term in terms for forces in term.forces(recording)]
+        wide.append(np.column_stack([d, _stack(recording, more)]) if more else d)
+    precision = np.concatenate([prior, np.zeros(wide[0].shape[1] - prior.size)])
+    normal = sum((d.T @ d for d in wide), np.diag(precision))
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    normal = normal / np.outer(scale, scale) + 1e-9 * np.eye(scale.size)
+    right = sum((d.T @ z for (_, z, _), d in zip(blocks, wide, strict=True)), np.zeros(scale.size))
+    values = np.linalg.solve(normal, right / scale) / scale
+    rests = [(recording, z - d @ values) for (recording, z, _), d in zip(blocks, wide, strict=True)]
     sums: dict[str, np.ndarray] = {}
     counts: dict[str, float] = {}
     for recording, rest in rests:
@@ -369,7 +408,7 @@ def _surprise(rest: np.ndarray, d: np.ndarray, covariance: np.ndarray) -> float:
     return float(rest @ rest - along @ np.linalg.solve(inner, along) + (size if sign > 0 else 0.0))
 
 
-def _size(recording: Recording, effect: Named, raw: np.ndarray) -> tuple[str, float]:
+def _size(recording: Recording, effect: Named) -> tuple[str, float]:
     """Return (unit, rms) of what an effect adds along a motion: a force, or the error of a reading."""
     known = CATALOGUE[effect.name]
     values = _mean_values(effect)
@@ -388,10 +427,10 @@ def _rms(values: np.ndarray | None) -> float:
 def _rivals(
     one: Named,
     named: Sequence[Named],
+    terms: Sequence[Term],
     base_columns: Callable[[Recording], np.ndarray],
     prior: np.ndarray,
     base_values: np.ndarray,
-    recordings: list[Recording],
     blocks: Sequence[tuple[Recording, np.ndarray, np.ndarray]],
     filters: dict[str, tuple[np.ndarray, float]],
 ) -> dict[tuple[str, str], _Model]:
@@ -400,10 +439,9 @@ def _rivals(
     if not wanted:
         return {}
     others = [effect for effect in named if effect is not one]
-    terms = [term for term in hypotheses.effect_terms(recordings, grids_for(recordings)) if term.key in wanted]
     best: dict[tuple[str, str], tuple[float, _Model]] = {}
     for term in terms:
-        if term.scope == "run" or not term.amplitudes:
+        if term.key not in wanted or term.scope == "run":
             continue
 
         def columns(recording: Recording, rest: np.ndarray, term: Term = term) -> np.ndarray:

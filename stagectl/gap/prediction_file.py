@@ -42,4 +42,6 @@ def _write(path: Path, content: dict[str, Any]) -> None:
     try:
         replace_whole(path, json.dumps({"format": _FORMAT, **content}, indent=2, allow_nan=False).encode())
     except OSError as error:
-        raise RecordError(f"{path}: can't be written: {error.strerror}; free some space, or check permissions") from error
+        raise RecordError(
+            f"{path}: can't be written: {error.strerror}; free some space, or check permissions"
+        ) from error
