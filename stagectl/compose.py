@@ -10,7 +10,6 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -220,7 +219,6 @@ def structure_of(effects: Iterable[Mapping[str, Any]]) -> tuple[tuple[str, str],
     return tuple((row["name"], row["acts_on"]) for row in _check(effects))
 
 
-@cache
 def forces_module(structure: tuple[tuple[str, str], ...]) -> ModuleType:
     """Return the module with one compiled function a place (see `stagectl.effects.PLACES`).
 

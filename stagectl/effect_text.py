@@ -58,6 +58,7 @@ def declare(text: str, title: str) -> tuple[str, ...]:
             whose = "stagectl's own" if not CATALOGUE[name].origin else "one of another text in this process"
             raise ProfileError(f"{title}: {name} is the name of an effect already, {whose}; rename yours")
     before = set(CATALOGUE)
+    compose.forget_module("effects", text)  # its declarations are made by its import
     try:
         compose.generated_module("effects", text)
         found = [CATALOGUE[name] for name in CATALOGUE if name not in before]

@@ -5,9 +5,11 @@ import json
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from stagectl import cli
+from stagectl import cli, compose
+from stagectl.effects import CATALOGUE
 from stagectl.errors import ProfileError, RecordError, RequestError
 from stagectl.gap.application import application, applied
 from stagectl.gap.believed import document_of, load_believed
@@ -38,6 +40,16 @@ COGGING = Named(
     (("current_ripple", "macro_actuator", 3.0),),
     confirmed=True,
 )
+
+CURVE = {
+    "over": "position_m",
+    "acts_on": "macro_force",
+    "knots": [float(f"{-0.1 + 0.03 * k / 11:.6g}") for k in range(12)],
+    "values_n": [0.1 * k * k for k in range(12)],
+    "sds_n": [0.01] * 12,
+    "gain": 90.0,
+    "held_out_gain": 40.0,
+}
 
 
 def _text(path: Path) -> str:
@@ -202,6 +214,26 @@ def test_what_a_profile_can_not_hold_is_left_with_its_reason():
     assert done.left == ("micro_mass_kg is off by 0.1: this file has no micro.mass_kg",)
 
 
+def test_an_unknown_curve_becomes_a_table_without_a_name():
+    findings = _findings(AXIS, unknown=CURVE, verdict="unknown")
+    text, table = _apply(AXIS, findings, candidates=True)
+    row = table["effects"][-1]
+    assert (row["name"], row["acts_on"], row["first_m"]) == ("force_over_position", "macro_force", -0.1)
+    along = compose.along(CATALOGUE["force_over_position"])
+    values = np.array([*(row[name] for name in CATALOGUE["force_over_position"].parameters), 0.0])
+    knots = np.array(CURVE["knots"])
+    found = along(np.concatenate([knots, 0.5 * (knots[1:] + knots[:-1])])[:, None], values, np.zeros(1))
+    assert found[:12] == pytest.approx(CURVE["values_n"], abs=2e-3)
+    assert found[12:] == pytest.approx([0.1 * (k * k + k + 0.5) for k in range(11)], abs=2e-3)
+    assert "unknown, a table of its curve and no name" in text
+    assert "(95 %)" in _line(text, "force_12_n")
+    done = application(_text(AXIS), dataclasses.replace(findings, named=(OFFSET,)), candidates=False, date=DATE)
+    assert "a table is written with --candidates" in done.left[0]
+    timely = dataclasses.replace(findings, unknown=CURVE | {"over": "t_s"})
+    with pytest.raises(RequestError, match="over t_s: it is of one recording"):
+        applied(_text(AXIS), timely, candidates=True, date=DATE)
+
+
 def test_comments_survive_where_values_stand_in_one_line():
     text = 'name = "x"\nmacro = { mass_kg = 2.0 } # one line\n'
     text += "effects = [\n  # none yet\n]\n[cycle]\nlatch_s = 1e-4 # guess\n"
@@ -237,7 +269,10 @@ def test_comments_survive_where_values_stand_in_one_line():
         ({"named": (dataclasses.replace(OFFSET, sds={"force_n": None}),)}, "values that are no numbers"),
         ({"named": (OFFSET,), "parameter_errors": (ParameterError("mass", 0.1, 0.1, 0.1),)}, "mass is no parameter"),
         ({}, "the findings name nothing$"),
-        ({"unknown": {"over": "position_m"}}, "nothing to write.*unknown curve"),
+        ({"unknown": {"over": "position_m"}}, "damaged.*the unknown curve lacks acts_on"),
+        ({"unknown": CURVE | {"knots": [0.0, *CURVE["knots"][1:]]}}, "damaged.*uneven steps"),
+        ({"unknown": CURVE | {"values_n": [1.0]}}, "damaged.*has not 12 numbers"),
+        ({"unknown": CURVE}, "nothing to write.*unknown curve over position_m: a table.*--candidates"),
         ({"named": (dataclasses.replace(OFFSET, confirmed=False),)}, "none of 1 findings is confirmed.*--candidates"),
     ],
 )  # fmt: skip

@@ -162,7 +162,7 @@ def test_planned_commands_leave_no_gap(stage, settled):
     """Under the commands that were planned for it a believed machine moves as planned, to within the noise."""
     believed = settled[0]
     recording = prediction.prepared(planned_log(stage[1]["middle stroke"].trajectory, believed), believed)
-    z = prediction.balance.observed(recording)
+    z = prediction.observed(recording)
     assert np.sqrt(np.mean(z * z)) < 1.0
 
 

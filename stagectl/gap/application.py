@@ -3,6 +3,7 @@
 Every written value carries a comment with its 95 % interval; one line on top says from which runs. Pure.
 """
 
+import itertools
 import math
 import re
 import tomllib
@@ -16,6 +17,7 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, InlineTable, Item
 
 from stagectl.effects import CATALOGUE
+from stagectl.effects.table import KNOTS_COUNT, TABLES
 from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import addition
 from stagectl.gap.hypotheses import phase_of
@@ -24,6 +26,7 @@ from stagectl.gap.workflow import Findings, Named, ParameterError
 _SIGMAS = 1.96  # of a 95 % interval
 _LEAST_RATIO = 1e-3  # effects of the profile that were refitted by less stay as they are
 _DIGITS = 7
+_EVEN_RATIO = 0.01  # findings round their knots
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,10 +106,15 @@ def application(document_text: str, findings: Findings, *, candidates: bool, dat
         for error in _parameters_of_keys(sheet, findings):
             _write_parameter(sheet, error, whole)
         _write_refitted(sheet, findings, whole)
+    if findings.unknown is not None:
+        if candidates:
+            _write_table(sheet, findings.unknown)
+        else:
+            sheet.left.append(
+                f"the unknown curve over {findings.unknown['over']}: a table is written with --candidates"
+            )
     if not sheet.written:
         raise RequestError(_why_nothing(findings, sheet.left, candidates))
-    if findings.unknown is not None:
-        sheet.left.append(f"the unknown curve over {findings.unknown.get('over')}: it has no name; it stays there")
     top = f"# {sheet.mark}: values so marked are from `stagectl gap`, {_origin(findings)}; intervals are 95 %."
     lines = [_plain(top), *(_plain(f"# {note}") for note in sheet.notes)]
     return Application(_below_title(tomlkit.dumps(document), lines), tuple(sheet.written), tuple(sheet.left))
@@ -189,6 +197,25 @@ def _write_effect(sheet: _Sheet, effect: Named) -> None:
     table["acts_on"] = effect.acts_on
     for name, (value, half_width, remark) in values.items():
         sheet.set(table, name, Change(f"{key}.{name}", value, None, half_width, effect.confirmed, remark))
+
+
+def _write_table(sheet: _Sheet, unknown: Mapping[str, Any]) -> None:
+    """Write the curve of an unknown force as a table; it names nothing."""
+    over = unknown["over"]
+    name = next((table for table, quantity in TABLES.items() if quantity == over), None)
+    if name is None:
+        sheet.left.append(f"the unknown curve over {over}: it is of one recording, a profile can't hold it")
+        return
+    knots = unknown["knots"]
+    step = (knots[-1] - knots[0]) / (len(knots) - 1)
+    known = CATALOGUE[name]
+    values = [(knots[0], None), (step, None)]
+    values += [(v, _SIGMAS * sd) for v, sd in zip(unknown["values_n"], unknown["sds_n"], strict=True)]
+    key, table = sheet.add_effect(f"{sheet.mark}: unknown, a table of its curve and no name; not confirmed")
+    table["name"] = name
+    table["acts_on"] = unknown["acts_on"]
+    for parameter, (value, half_width) in zip(known.parameters, values, strict=True):
+        sheet.set(table, parameter, Change(f"{key}.{parameter}", value, None, half_width, confirmed=False))
 
 
 def _values_of(effect: Named) -> dict[str, tuple[float, float | None, str]]:
@@ -426,10 +453,22 @@ def _refuse_damaged(findings: Findings) -> None:
             problem = f"{error.name} is no parameter"
         elif not _are_numbers([error.error, error.sd]):
             problem = f"{error.name} has values that are no numbers"
+    if findings.unknown is not None and (said := _curve_problem(findings.unknown)):
+        problem = f"the unknown curve {said}"
     if not _are_numbers(list(findings.refitted.values())):
         problem = "refitted values that are no numbers"
     if problem:
         raise RequestError(f"the findings are damaged or of another version: {problem}; run `stagectl gap` again")
+
+
+def _curve_problem(unknown: Mapping[str, Any]) -> str:
+    if strange := [name for name in ("over", "acts_on", "knots", "values_n", "sds_n") if name not in unknown]:
+        return f"lacks {strange[0]}"
+    lists = [unknown[name] for name in ("knots", "values_n", "sds_n")]
+    if not all(isinstance(one, list) and len(one) == KNOTS_COUNT and _are_numbers(one) for one in lists):
+        return f"has not {KNOTS_COUNT} numbers in knots, values_n and sds_n"
+    steps = [after - before for before, after in itertools.pairwise(lists[0])]
+    return "" if 0.0 < max(steps) < (1.0 + _EVEN_RATIO) * min(steps) else "has knots at uneven steps"
 
 
 def _are_numbers(values: list[Any]) -> bool:
@@ -447,5 +486,4 @@ def _why_nothing(findings: Findings, left: list[str], candidates: bool) -> str:
             f"nothing to write: none of {found} findings is confirmed; confirm by a new recording "
             "(`stagectl gap next`), or write candidates with --candidates"
         )
-    unknown = " but an unknown curve, which has no name" if findings.unknown is not None else ""
-    return f"nothing to write: the findings name nothing{unknown}"
+    return "nothing to write: the findings name nothing"

@@ -9,6 +9,7 @@ import numpy as np
 
 from stagectl.effect_text import shape_of
 from stagectl.effects import CATALOGUE, Effect
+from stagectl.effects.table import TABLES
 from stagectl.gap.balance import Recording
 
 _SMOOTHING_M_PER_S = 1e-4
@@ -20,6 +21,7 @@ FREE_SHAPES: dict[str, tuple[str, ...]] = {
     "dahl_friction": ("slip_m",),
     "lugre_friction": ("slip_m", "static_ratio", "stribeck_m_per_s"),
     "cable_hysteresis": ("slip_m",),
+    "cable_spring": ("anchor_m",),
     "soft_contact": ("knee_m",),
     "force_constant_saturation": ("saturation_n",),
     "amplifier_dead_band": ("half_width_a",),
@@ -76,6 +78,7 @@ def grids_for(recordings: list[Recording]) -> Grid:
     }
     mine = recordings[0].believed.own_effects
     own = [known for known in CATALOGUE.values() if known.origin]
+    library |= {name: [] for name in TABLES}  # twelve forces fit anything: never a name
     return library | {known.name: _grid_of(known) if known.name in mine else [] for known in own}
 
 

@@ -17,8 +17,8 @@ _DRAWN: dict[bool, tuple[tuple[str, str, dict[str, tuple[float, float]]], ...]] 
         ),
     ),
 }
-"""By whether the stage has a micro: name, place, range of each parameter. On the end itself, where the error shows; more
-than 0.6 N there, and homing no longer finds the edges of the joint."""
+"""By whether the stage has a micro: name, place, range of each parameter. On the end itself, where the error shows;
+with more than 0.6 N there homing no longer finds the edges of the joint."""
 
 
 def drawn(seed: int, has_micro: bool) -> dict[str, Any]:

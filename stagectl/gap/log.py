@@ -36,6 +36,9 @@ _PERIOD_RATIO = 5e-3  # a period that is wrong by this makes every force wrong b
 _JITTER_RATIO = 0.05  # of a period, rms: at 0.1 m/s and 1 kHz it is 5 um
 _MILLIMETRES_SPAN = 2.0
 _LIMIT_RATIO = 0.999
+_BEYOND_RATIO = 1.5
+_STUCK_COUNT = 20
+_STUCK_RATIO = 3.0
 _UNDER_LAW = (Phase.TRACKING, Phase.STOPPING)  # in a guided stop the macro's drive makes its own force
 
 
@@ -58,7 +61,7 @@ class Log:
     command_extra_n: np.ndarray | None = None  # known, added to the macro's command behind its controller
     macro_payload_kg: float = 0.0
     end_payload_kg: float = 0.0
-    macro_current_a: np.ndarray | None = None  # as the drive reports it at the sample
+    macro_current_a: np.ndarray | None = None  # as the drive reports it at the sample; ours at the SYNC behind it
     micro_current_a: np.ndarray | None = None
     start_s: float = 0.0  # since the machine was switched on, or since its first recording: drift and wear know no runs
     remarks: tuple[str, ...] = field(default=())
@@ -140,14 +143,18 @@ def log_of_rows(
     """Put rows on the sensor's grid, leave out what can't be used, and say so. Errors: RecordError."""
     remarks: list[str] = []
     place = _places(rows, name, period_s, imported)
+    first_place = place[0] if place.size else 0
     rows, place = _longest_whole(rows, place, name, period_s, remarks)
     if rows.size < LEAST_SAMPLES_COUNT:
         raise RecordError(
             f"{name}: {rows.size} rows in motion, at least {LEAST_SAMPLES_COUNT} are needed; record a longer motion"
         )
+    started = int(place[0] - first_place)
     place = place - place[0]
     count = int(place[-1]) + 1
-    fresh = (rows["samples_new"] > 0) & (rows["sequence"] == rows["cycle"]) if not imported else np.ones(rows.size, bool)
+    fresh = (
+        (rows["samples_new"] > 0) & (rows["sequence"] == rows["cycle"]) if not imported else np.ones(rows.size, bool)
+    )
     columns = {
         column: _on_grid(rows[column].astype(float), place, count, fresh if column.endswith("position_m") else None)
         for column in _COLUMNS
@@ -180,8 +187,9 @@ def log_of_rows(
         end_position_m=values.get("end_position_m"),
         micro_command_n=values.get("micro_force_n"),
         reference_m=values.get("setpoint_position_m"),
-        macro_current_a=_current_a(values, "macro", believed),
-        micro_current_a=_current_a(values, "micro", believed),
+        macro_current_a=_current_a(values, "macro", believed, imported),
+        micro_current_a=_current_a(values, "micro", believed, imported),
+        start_s=(started + kept.start) * period_s,
         remarks=tuple(remarks),
     )
 
@@ -287,7 +295,8 @@ def _unsaturated(
 ) -> slice:
     """Return the longest stretch in which no command stands at its limit for long.
 
-    What the force does meanwhile nobody knows, and the motion remembers it: the stretches are not joined.
+    What the force does meanwhile nobody knows, and the motion remembers it: the stretches are not joined. A command far
+    beyond its limit is none of this profile, or in another unit. Errors: RecordError.
     """
     count = values["macro_force_n"].size
     least = max(2, round(SATURATED_S / period_s))
@@ -296,6 +305,12 @@ def _unsaturated(
         belief = None if believed is None else getattr(believed, axis)
         if column not in values or belief is None or not math.isfinite(belief.force_limit_n):
             continue
+        highest_n = float(np.max(np.abs(values[column])))
+        if highest_n > _BEYOND_RATIO * belief.force_limit_n:
+            raise RecordError(
+                f"{name}: {column} reaches {highest_n:.4g} N, the profile limits it to {belief.force_limit_n:g} N; "
+                "check the column's unit in the import, or correct the profile's limit"
+            )
         at_limit = np.abs(values[column]) >= _LIMIT_RATIO * belief.force_limit_n
         starts, ends = _stretches(at_limit)
         for start, end in zip(starts, ends, strict=True):
@@ -333,6 +348,9 @@ def _check_values(values: dict[str, np.ndarray], name: str, remarks: list[str]) 
                 f"{name}: {column} spans {span_m:.3g} m; are these millimetres, or is it another column? Give column "
                 "and unit in the import"
             )
+    for column in ("macro_position_m", "end_position_m"):
+        if column in values:
+            _check_alive(values[column], f"{name}: {column}")
     if not np.ptp(values["macro_force_n"]) > 0.0:
         raise RecordError(f"{name}: macro_force_n is constant; swapped columns, or the stage was not driven")
     moved_m = float(np.ptp(values["macro_position_m"]))
@@ -340,12 +358,44 @@ def _check_values(values: dict[str, np.ndarray], name: str, remarks: list[str]) 
         remarks.append(f"{name}: the macro moved by {moved_m * 1e6:.1f} um only; what depends on motion is not seen")
 
 
-def _current_a(values: dict[str, np.ndarray], axis: str, believed: Believed | None) -> np.ndarray | None:
+def _check_alive(position_m: np.ndarray, place: str) -> None:
+    """Refuse a position that is held while the stage moves: a sensor that stuck, or one slower than the table."""
+    steps_m = np.abs(np.diff(position_m))
+    if not steps_m.any():
+        return  # constant: said elsewhere
+    held = steps_m == 0.0
+    starts, ends = _stretches(held)
+    jumps_m = np.where(ends < steps_m.size, steps_m[np.minimum(ends, steps_m.size - 1)], 0.0)
+    usual_m = float(np.quantile(steps_m[~held], 0.999))
+    stuck = (ends - starts >= _STUCK_COUNT) & (jumps_m > _STUCK_RATIO * usual_m)
+    if stuck.any():
+        first = int(np.argmax(stuck))
+        raise RecordError(
+            f"{place} stays the same for {int(ends[first] - starts[first]) + 1} samples from sample "
+            f"{int(starts[first])} on and then jumps by {jumps_m[first] * 1e6:.3g} um; the sensor stuck: cut the "
+            "recording there"
+        )
+    reach = _STUCK_COUNT // 2
+    least_m = float(steps_m[~held].min())
+    moving = np.abs(position_m[2 * reach :] - position_m[: -2 * reach])[: held.size - reach] > 4 * reach * least_m
+    repeated = float(held[reach : reach + moving.size][moving].mean()) if moving.any() else 0.0
+    if repeated > GAP_LIMIT_RATIO:
+        raise RecordError(
+            f"{place} repeats the sample before in {repeated:.0%} of the samples in motion, limit "
+            f"{GAP_LIMIT_RATIO:.0%}; the sensor is slower than the table: import it at the sensor's own rate"
+        )
+
+
+def _current_a(
+    values: dict[str, np.ndarray], axis: str, believed: Believed | None, imported: bool
+) -> np.ndarray | None:
     """Return the current behind the force that a drive reports."""
     force_n = values.get(f"{axis}_reported_force_n")
     belief = None if believed is None else getattr(believed, axis)
     if force_n is None or belief is None:
         return None
+    if not imported:  # a row of ours holds what was sampled at the SYNC of the cycle before
+        force_n = np.concatenate([force_n[1:], force_n[-1:]])
     return force_n / belief.force_constant_n_per_a
 
 

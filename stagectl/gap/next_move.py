@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stagectl.gap import hypotheses, prediction
-from stagectl.gap.balance import channels, column
+from stagectl.gap.balance import channels
 from stagectl.gap.believed import Believed
 from stagectl.gap.grids import grids_for
 from stagectl.gap.moves import Move
@@ -133,7 +133,7 @@ def excitations(believed: Believed, findings: Findings, moves: Sequence[Move]) -
             name = f"{term.name} on {term.acts_on}"
             if name not in wanted:
                 continue
-            energy = max(float(np.sum(column(recording, forces) ** 2)) for forces in term.forces(recording))
+            energy = max(float(np.sum(prediction.column(recording, forces) ** 2)) for forces in term.forces(recording))
             if energy > best.get(name, (0.0, ""))[0]:
                 best[name] = (energy, move.name)
     return [(name, best[name][1]) for name in sorted(best)]

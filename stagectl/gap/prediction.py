@@ -145,7 +145,7 @@ def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evi
     blocks = []
     for recording in recordings:
         known.append((recording, base_columns(recording)))
-        z = balance.observed(recording)
+        z = observed(recording)
         blocks.append((recording, z, columns(recording, z)))
     prior = np.array([1.0 / sd**2 for _, sd in base] + [0.0] * len(named))
     wanted = {alias[:2] for one in named for alias in one.aliases}
@@ -204,7 +204,7 @@ def expected(seen: Evidence, log: Log) -> list[Expected]:
 def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Outcome]:
     """Judge predictions by a recording that nobody had seen: values as found, nothing refitted."""
     recording = prepared(log, seen.believed)
-    z = balance.observed(recording)
+    z = observed(recording)
     raw = seen.model.columns(recording, z)
     d, zw = _white(recording, raw, seen.filters), _white(recording, z, seen.filters)
     first = len(seen.base)
@@ -245,6 +245,17 @@ def prepared(log: Log, believed: Believed) -> Recording:
     recording = balance.recording_of(log, believed)
     balance.set_noise(recording, first_noise(believed, recording))
     return recording
+
+
+def observed(recording: Recording) -> np.ndarray:
+    """Return the innovations of all channels, one behind the other."""
+    return np.concatenate(balance.observed(recording))
+
+
+def column(recording: Recording, forces: Forces) -> np.ndarray:
+    """Return what forces add to the innovations of all channels, one behind the other."""
+    parts = zip(balance.channels(recording), balance.column(recording, forces), strict=True)
+    return np.concatenate([np.zeros(size) if part is None else part for (_, size), part in parts])
 
 
 def _per_run(effect: Named) -> bool:
@@ -311,11 +322,11 @@ def _mean_values(effect: Named) -> dict[str, float]:
 def _column(recording: Recording, effect: Named, values: dict[str, float]) -> np.ndarray:
     known = CATALOGUE[effect.name]
     forces = balance.effect_forces(recording, known, effect.acts_on, [values[name] for name in known.parameters])
-    return balance.column(recording, forces)
+    return column(recording, forces)
 
 
 def _stack(recording: Recording, forces: Sequence[Forces]) -> np.ndarray:
-    return np.column_stack([balance.column(recording, one) for one in forces])
+    return np.column_stack([column(recording, one) for one in forces])
 
 
 def _filters(
