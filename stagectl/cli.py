@@ -141,6 +141,10 @@ FindingsArgument = Annotated[Path, typer.Argument(help="findings.json of a searc
 NewProfile = Annotated[Path, _option("Profile to write.", "--out", "-o", metavar="NEW_PROFILE")]
 Candidates = Annotated[bool, _option("Write what is not confirmed yet too, marked so.", "--candidates")]
 Force = Annotated[bool, _option("Replace NEW_PROFILE where it is there already; never PROFILE.", "--force")]
+DoIt = Annotated[bool, _option("Do the move on the stage or the rig, and judge the prediction.", "--run")]
+FindingsProfile = Annotated[
+    str | None, _option("Profile, where that of the findings is not found.", "--profile", "-p", metavar="NAME")
+]
 GapFolder = Annotated[Path, _option("Folder of the findings.", "--out", metavar="FOLDER")]
 
 _PROFILE, _RUNS, _GAP = "oled-printer", Path("runs"), Path("gap")
@@ -358,6 +362,27 @@ def gap_apply(
 ) -> None:
     """Write a new profile with what was confirmed: values, 95 % intervals, runs, date; the old comments stay."""
     _deliver("gap apply", json, lambda voice: commands.gap.apply(voice, profile, findings, out, candidates, force))
+
+
+@gap_app.command("next", epilog=_epilog("stagectl gap next gap", "stagectl gap next gap --run --backend rig"))
+def gap_next(
+    findings: FindingsArgument,
+    run: DoIt = False,
+    profile: FindingsProfile = None,
+    backend: Wire = "auto",
+    seed: Seed = 1,
+    runs: Runs = _RUNS,
+    json: Json = False,
+) -> None:
+    """Propose the move that settles what is open, and write down what it will show; `--run` does it and judges."""
+    work = commands.gap_next.show
+    _deliver("gap next", json, lambda voice: work(voice, findings, profile, runs, run, backend, seed))
+
+
+@gap_app.command("demo", epilog=_epilog("stagectl gap demo", "stagectl gap demo --seed 7"))
+def gap_demo(profile: Profile = _PROFILE, seed: Seed = 1, runs: Runs = _RUNS, json: Json = False) -> None:
+    """Hide an effect in the rig, find it, confirm it, add it, and follow the same move better; virtual time."""
+    _deliver("gap demo", json, lambda voice: commands.gap_demo.show(voice, profile, runs, seed))
 
 
 _USAGE_ERROR: Any = typer.BadParameter.__base__

@@ -10,6 +10,7 @@ from stagectl.errors import RecordError
 from stagectl.gap.workflow import Findings, Named, ParameterError
 from stagectl.whole_file import replace_whole
 
+FINDINGS = "findings.json"
 _FORMAT = 1
 
 

@@ -109,7 +109,13 @@ def _under_law(run: Run, period_s: float) -> np.ndarray:
     rows = run.rows[np.isin(run.rows["run_phase"], [int(phase) for phase in _UNDER_LAW])]
     if rows.size:
         homings, counts = np.unique(rows["homing_id"], return_counts=True)
-        rows = rows[rows["homing_id"] == homings[np.argmax(counts)]].copy()
+        homing = int(homings[np.argmax(counts)])
+        rows = rows[rows["homing_id"] == homing].copy()
+        # Homing presses both edges in a zero that is wrong by up to half the gap: no motion that a user asked for.
+        ends = [e["t_ns"] for e in run.events if e.get("event") == "homing" and int(e["number"]) == homing]
+        if ends:
+            rows = rows[rows["t_ns"] > ends[-1]]
+    if rows.size:
         _put_in_one_zero(rows, run.events)
     return rows
 

@@ -1,0 +1,139 @@
+"""Which move to record next: the one on which what was found, and what explains it as well, differ most. Pure.
+
+Every effect has moves that suit it, by what it is; among those the one is taken that the model says most of. Where
+none of them decides, the whole library is asked.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stagectl.gap import hypotheses, prediction
+from stagectl.gap.balance import channels
+from stagectl.gap.believed import Believed
+from stagectl.gap.grids import grids_for
+from stagectl.gap.moves import Move
+from stagectl.gap.planned import planned_log
+from stagectl.gap.prediction import DETECTED, Evidence, Expected
+from stagectl.gap.workflow import Findings
+
+_LOW_SPEED = ("slow reversals", "creep")
+_STROKES = ("slow stroke", "middle stroke", "fast stroke")
+_ACCELERATED = ("fast stroke", "sine 0.3 Hz", "sine 1 Hz", "sine 3 Hz")
+_HOLDS = ("holds at several places", "slow stroke", "middle stroke")
+_TOUCH = ("sweep over both edges",)
+_LONG = ("one minute of strokes",)
+
+SUITED: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(
+        (
+            "coulomb_friction",
+            "asymmetric_coulomb_friction",
+            "stribeck_friction",
+            "sublinear_viscous_friction",
+            "dahl_friction",
+            "lugre_friction",
+        ),
+        _LOW_SPEED,
+    ),
+    **dict.fromkeys(
+        ("viscous_friction", "asymmetric_viscous_friction", "quadratic_drag", "position_dependent_friction"), _STROKES
+    ),
+    **dict.fromkeys(("cogging", "cyclic_error", "scale_error", "abbe_error"), _STROKES),
+    **dict.fromkeys(
+        (
+            "current_ripple",
+            "load_dependent_friction",
+            "force_constant_saturation",
+            "micro_reaction",
+            "current_loop_lag",
+            "command_delay",
+            "sensor_delay",
+            "sensor_lag",
+            "flexible_mode",
+        ),
+        _ACCELERATED,
+    ),
+    **dict.fromkeys(("cable_spring", "cable_hysteresis", "gravity_tilt", "offset", "linear_stiffness"), _HOLDS),
+    **dict.fromkeys(
+        ("contact_damping", "contact_hysteresis", "soft_contact", "backlash_wear", "backlash_centre_shift"), _TOUCH
+    ),
+    **dict.fromkeys(("thermal_drift", "clock_skew"), _LONG),
+}
+"""By effect the moves that excite it, by name; effects that are not in it are asked of the whole library."""
+
+_NEVER_APART = DETECTED  # d' below which a name is out of reach of every move of the library
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """One move with what is expected of it, for the effect that it was chosen for."""
+
+    move: Move
+    name: str
+    acts_on: str
+    d_prime: float  # to the closest effect that explains the findings as well, or to none at all
+    against: tuple[tuple[str, str], ...]  # what it is to be told from; empty: from nothing
+    expected: tuple[Expected, ...]  # one for every named effect
+    never_apart: tuple[tuple[str, str], ...]  # aliases that no move of the library parts from it
+
+    @property
+    def decides(self) -> bool:
+        """Whether the run can settle anything."""
+        mine = [one for one in self.expected if (one.name, one.acts_on) == (self.name, self.acts_on)]
+        return bool(mine) and mine[0].decides and self.d_prime >= DETECTED
+
+
+def proposals(seen: Evidence, moves: Sequence[Move]) -> list[Proposal]:
+    """Return the best move for each effect that is not confirmed yet, or has aliases, in the order of the findings."""
+    by_move = [(move, prediction.expected(seen, planned_log(move.trajectory, seen.believed))) for move in moves]
+    found = []
+    for effect in seen.named:
+        if effect.confirmed and not effect.aliases:
+            continue
+        rows = [
+            (move, one, tuple(everything))
+            for move, everything in by_move
+            for one in everything
+            if (one.name, one.acts_on) == (effect.name, effect.acts_on)
+        ]
+        if not rows:
+            continue
+        keys = {(name, place) for _, one, _ in rows for name, place, _ in one.separations}
+        apart = {key for key in keys if max(_distance(one, (key,)) for _, one, _ in rows) >= _NEVER_APART}
+        suited = [row for row in rows if row[0].name in SUITED.get(effect.name, ())]
+        deciding = [row for row in suited if _distance(row[1], tuple(apart)) >= DETECTED and row[1].decides]
+        move, one, everything = max(deciding or rows, key=lambda row: _distance(row[1], tuple(apart)))
+        found.append(
+            Proposal(
+                move, effect.name, effect.acts_on, _distance(one, tuple(apart)), tuple(sorted(apart)), everything,
+                tuple(sorted(keys - apart)),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _distance(one: Expected, against: tuple[tuple[str, str], ...]) -> float:
+    """Return d' to the closest of some names, to nothing where none is given."""
+    return min((d for name, place, d in one.separations if (name, place) in against), default=one.d_prime)
+
+
+def excitations(believed: Believed, findings: Findings, moves: Sequence[Move]) -> list[tuple[str, str]]:
+    """Return (effect, move) for everything that the recordings did not excite: the move it shows most on."""
+    wanted = set(findings.not_excited)
+    if not wanted:
+        return []
+    best: dict[str, tuple[float, str]] = {}
+    for move in moves:
+        recording = prediction.prepared(planned_log(move.trajectory, believed), believed)
+        if not sum(size for _, size in channels(recording)):
+            continue
+        for term in hypotheses.effect_terms([recording], grids_for([recording])):
+            name = f"{term.name} on {term.acts_on}"
+            if name not in wanted:
+                continue
+            energy = max(float(np.sum(prediction.column(recording, forces) ** 2)) for forces in term.forces(recording))
+            if energy > best.get(name, (0.0, ""))[0]:
+                best[name] = (energy, move.name)
+    return [(name, best[name][1]) for name in sorted(best)]

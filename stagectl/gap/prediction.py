@@ -1,0 +1,505 @@
+"""What a finding says of a motion that nobody has recorded yet, written down before the fact, and judged after it.
+
+A finding predicts by how much the gap falls when its effect is known: with whitened innovations z of a recording, B the
+known parameters at the values of the findings and s what the effect alone does to them,
+
+    |z - B b|^2 - |z - B b - s|^2 = |s|^2 (2 a - 1),        a = s'(z - B b) / |s|^2
+
+a is 1 where the effect is there as found, 0 where it is not. In newtons the gap falls from a f to (1 - a) f, f being
+the rms of the force that was found, along the motion. The spread of a comes from noise, from what the recordings of the
+findings leave open in b and in the effect itself, and from how a scatters between them. Nothing is refitted but the
+phase of what repeats in position, where each homing has its own. Pure.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+
+from stagectl.effects import CATALOGUE
+from stagectl.errors import RequestError
+from stagectl.gap import balance, hypotheses
+from stagectl.gap.addition import parted
+from stagectl.gap.balance import Forces, Recording
+from stagectl.gap.believed import Believed
+from stagectl.gap.grids import grids_for
+from stagectl.gap.hypotheses import Term
+from stagectl.gap.log import Log
+from stagectl.gap.workflow import Findings, Named
+from stagectl.gap.workflow import _first_noise as first_noise
+
+SIGMAS = 1.96
+"""Of a 95 % interval."""
+
+DETECTED = 5.0
+"""Distance in standard deviations from which an effect counts as seen."""
+
+SEPARATED = 9.0
+"""Twice the log of the likelihood ratio beyond which of two names one is out."""
+
+_MATERIAL_RATIO = 0.01
+"""Share of an effect's own energy below which a margin may be the model's, not the name's."""
+
+_MOTION_RATIO = 0.01
+"""Standard deviation of an effect's size on a motion against that on the motion as planned."""
+
+_AR_ORDER = 12
+
+Columns = Callable[[Recording, np.ndarray], np.ndarray]
+"""What a hypothesis does to a recording's innovations, shape (m, k); the second argument is where phases come from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What one effect will do on one motion; intervals are 95 %, forces in N and sensor errors in m, rms."""
+
+    name: str
+    acts_on: str
+    unit: str
+    gap_before: float
+    gap_after: float  # what noise and uncertainty leave
+    fall: float  # of the gap: the effect's own size where it is there as found
+    fall_interval: tuple[float, float]
+    gain: float  # of log-likelihood, twice; of the motion as planned
+    share_interval: tuple[float, float]  # of the effect as found; 1 is exactly as found
+    d_prime: float
+    separations: tuple[tuple[str, str, float], ...] = ()  # d' to each effect that explains the findings as well
+
+    @property
+    def decides(self) -> bool:
+        """Whether the outcome can tell the effect from nothing, and from one half of it."""
+        return self.share_interval[0] > 0.5 and self.d_prime >= DETECTED
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a recording said of one prediction."""
+
+    name: str
+    acts_on: str
+    unit: str
+    gap_before: float
+    gap_after: float
+    fall: float
+    gain: float
+    share: float
+    inside: bool
+    better: tuple[tuple[str, str, float], ...]  # aliases that the recording prefers, by how much
+    out: tuple[tuple[str, str, float], ...]  # aliases that it rules out
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the prediction held and no other name does better."""
+        return self.inside and not self.better
+
+
+@dataclass(slots=True)
+class _Model:
+    """Known parameters and effects with the values of the findings, and what the recordings leave open."""
+
+    columns: Columns
+    values: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(slots=True)
+class Evidence:
+    """What the recordings of some findings say, ready to predict others."""
+
+    believed: Believed
+    named: tuple[Named, ...]
+    base: list[tuple[Term, float]]
+    base_values: np.ndarray
+    filters: dict[str, tuple[np.ndarray, float]]  # autoregression of what is left, by channel
+    model: _Model
+    rivals: dict[tuple[str, str], dict[tuple[str, str], _Model]]
+    late_ratio: float  # share of samples that the recordings lack
+    scatter: np.ndarray  # of each effect's share between recordings
+
+
+def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evidence:
+    """Read findings and their recordings for prediction. Errors: RequestError where there is nothing to predict."""
+    named = tuple(effect for effect in findings.named if not _per_run(effect))
+    if not named:
+        raise RequestError("these findings name no effect that could be predicted; `next` shows what to excite")
+    recordings = [prepared(log, believed) for log in logs]
+    base = hypotheses.parameter_terms(recordings[0])
+    base_values = np.array([findings.refitted.get(term.name, 0.0) for term, _ in base])
+
+    known: list[tuple[Recording, np.ndarray]] = []
+
+    def base_columns(recording: Recording) -> np.ndarray:
+        for other, block in known:
+            if other is recording:
+                return block
+        return _stack(recording, [forces for term, _ in base for forces in term.forces(recording)])
+
+    def columns(recording: Recording, rest: np.ndarray) -> np.ndarray:
+        found = base_columns(recording)
+        free = rest - found @ base_values
+        return np.column_stack([found, *_effect_columns(recording, named, free)])
+
+    values = np.concatenate([base_values, np.ones(len(named))])
+    blocks = []
+    for recording in recordings:
+        known.append((recording, base_columns(recording)))
+        z = observed(recording)
+        blocks.append((recording, z, columns(recording, z)))
+    prior = np.array([1.0 / sd**2 for _, sd in base] + [0.0] * len(named))
+    wanted = {alias[:2] for one in named for alias in one.aliases}
+    terms = [term for term in hypotheses.effect_terms(recordings, grids_for(recordings)) if term.key in wanted]
+    filters = _filters(blocks, prior, terms)
+    white = [(_white(r, z, filters), _white(r, d, filters)) for r, z, d in blocks]
+    covariance = np.linalg.inv(sum((d.T @ d for _, d in white), np.diag(prior)))
+    model = _Model(columns, values, covariance)
+    scatter = _scatter(white, values, len(named))
+    late_ratio = float(np.mean([1.0 - log.valid.mean() for log in logs]))
+    rivals = {
+        (one.name, one.acts_on): _rivals(one, named, terms, base_columns, prior, base_values, blocks, filters)
+        for one in named
+    }
+    return Evidence(believed, named, base, base_values, filters, model, rivals, late_ratio, scatter)
+
+
+def expected(seen: Evidence, log: Log) -> list[Expected]:
+    """Say what each effect will do on a planned motion, one a named effect in their order.
+
+    Samples come late as often as in the recordings of the findings.
+    """
+    late = np.random.default_rng(0).random(log.samples_count) < seen.late_ratio
+    log = replace(log, valid=log.valid & ~late)
+    recording = prepared(log, seen.believed)
+    nothing = np.zeros(sum(size for _, size in balance.channels(recording)))
+    raw = seen.model.columns(recording, nothing)
+    d = _white(recording, raw, seen.filters)
+    first = len(seen.base)
+    found = []
+    for number, effect in enumerate(seen.named):
+        s = d[:, first + number]
+        energy = float(s @ s)
+        if not energy > 0.0:
+            continue
+        unit, size = _size(recording, effect)
+        sd = _share_sd(d, s, seen.model.covariance, float(seen.scatter[number]))
+        low, high = 1.0 - SIGMAS * sd, 1.0 + SIGMAS * sd
+        spread = SIGMAS * size * float(np.hypot(2.0 * sd, _MOTION_RATIO))
+        planned = raw[:, first + number] + raw[:, :first] @ seen.base_values
+        separations = tuple(
+            (*key, _separation(recording, seen, d[:, :first], s, rival, planned))
+            for key, rival in seen.rivals[effect.name, effect.acts_on].items()
+        )
+        free = _free_energy(d, first + number, seen.model.covariance, first)
+        found.append(
+            Expected(
+                effect.name, effect.acts_on, unit, size, size * sd, size,
+                (size - spread, size + spread), energy, (low, high), float(np.sqrt(free)),
+                separations,
+            )
+        )  # fmt: skip
+    return found
+
+
+def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Outcome]:
+    """Judge predictions by a recording that nobody had seen: values as found, nothing refitted."""
+    recording = prepared(log, seen.believed)
+    z = observed(recording)
+    raw = seen.model.columns(recording, z)
+    d, zw = _white(recording, raw, seen.filters), _white(recording, z, seen.filters)
+    first = len(seen.base)
+    whole = zw - d @ seen.model.values
+    mine = _surprise(whole, d, seen.model.covariance)
+    outcomes = []
+    for prediction in predictions:
+        number = [(one.name, one.acts_on) for one in seen.named].index((prediction.name, prediction.acts_on))
+        s = d[:, first + number]
+        energy = float(s @ s)
+        share = 1.0 + float(s @ whole) / energy if energy > 0.0 else 0.0
+        unit, size = _size(recording, seen.named[number])
+        fall = size * (2.0 * share - 1.0)
+        margins = []
+        for key, rival in seen.rivals[prediction.name, prediction.acts_on].items():
+            other = _white(recording, rival.columns(recording, z), seen.filters)
+            margins.append((*key, _surprise(zw - other @ rival.values, other, rival.covariance) - mine))
+        low, high = prediction.share_interval
+        inside = (
+            prediction.decides
+            and low <= share <= high
+            and prediction.fall_interval[0] <= fall <= prediction.fall_interval[1]
+        )
+        limit = max(SEPARATED, _MATERIAL_RATIO * energy)
+        outcomes.append(
+            Outcome(
+                prediction.name, prediction.acts_on, unit, size * abs(share), size * abs(1.0 - share),
+                fall, energy * (2.0 * share - 1.0), share, inside,
+                tuple(row for row in margins if row[2] < -limit),
+                tuple(row for row in margins if row[2] > limit),
+            )
+        )  # fmt: skip
+    return outcomes
+
+
+def prepared(log: Log, believed: Believed) -> Recording:
+    """Prepare a log with the noise that the search begins with."""
+    recording = balance.recording_of(log, believed)
+    balance.set_noise(recording, first_noise(believed, recording))
+    return recording
+
+
+def observed(recording: Recording) -> np.ndarray:
+    """Return the innovations of all channels, one behind the other."""
+    return np.concatenate(balance.observed(recording))
+
+
+def column(recording: Recording, forces: Forces) -> np.ndarray:
+    """Return what forces add to the innovations of all channels, one behind the other."""
+    parts = zip(balance.channels(recording), balance.column(recording, forces), strict=True)
+    return np.concatenate([np.zeros(size) if part is None else part for (_, size), part in parts])
+
+
+def _per_run(effect: Named) -> bool:
+    """Tell whether an effect has another size in each run: there is nothing to predict."""
+    return any(parted(name)[1].startswith("run ") for name in effect.parameters)
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What an effect does as found: one column, or for each amplitude with a free phase its sine and cosine."""
+
+    column: np.ndarray | None
+    pairs: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+
+
+def _effect_columns(recording: Recording, named: Sequence[Named], rest: np.ndarray) -> list[np.ndarray]:
+    """Return what each effect does as found; phases of a homing are those that suit the rest best."""
+    parts = [_part(recording, effect) for effect in named]
+    waves = [wave for part in parts for pair in part.pairs for wave in pair]
+    shares = np.zeros(0)
+    if waves:
+        fixed = sum((part.column for part in parts if part.column is not None), np.zeros(rest.size))
+        stacked = np.column_stack(waves)
+        scale = np.maximum(np.sqrt(np.einsum("ij,ij->j", stacked, stacked)), 1e-300)
+        shares = np.linalg.lstsq(stacked / scale, rest - fixed, rcond=1e-9)[0] / scale
+    found, place = [], 0
+    for part in parts:
+        total = np.zeros(rest.size) if part.column is None else part.column
+        for sine, cosine in part.pairs:
+            a, b = shares[place], shares[place + 1]
+            place += 2
+            length = float(np.hypot(a, b))
+            a, b = (a / length, b / length) if length > 0.0 else (1.0, 0.0)
+            total = total + a * sine + b * cosine
+        found.append(total)
+    return found
+
+
+def _part(recording: Recording, effect: Named) -> _Part:
+    """Evaluate an effect as found; where its phases are those of homings, at both quadratures."""
+    known = CATALOGUE[effect.name]
+    values = _mean_values(effect)
+    pairs = [(name, hypotheses.phase_of(known, name)) for name in known.linear]
+    free = [(name, phase) for name, phase in pairs if phase is not None]
+    if not free or {parted(name)[1] for name in effect.parameters} == {""}:
+        return _Part(_column(recording, effect, values))
+    found = []
+    for name, phase in free:
+        alone = values | {other: 0.0 for other, _ in free if other != name}
+        sine, cosine = (_column(recording, effect, alone | {phase: angle}) for angle in (0.0, 0.5 * np.pi))
+        found.append((sine, cosine))
+    return _Part(None, tuple(found))
+
+
+def _mean_values(effect: Named) -> dict[str, float]:
+    """Return every parameter's value, of those that differ from homing to homing the mean."""
+    values: dict[str, list[float]] = {}
+    for name, value in effect.parameters.items():
+        values.setdefault(parted(name)[0], []).append(value)
+    known = CATALOGUE[effect.name].parameters
+    return {name: float(np.mean(values.get(name, [0.0]))) for name in known}
+
+
+def _column(recording: Recording, effect: Named, values: dict[str, float]) -> np.ndarray:
+    known = CATALOGUE[effect.name]
+    forces = balance.effect_forces(recording, known, effect.acts_on, [values[name] for name in known.parameters])
+    return column(recording, forces)
+
+
+def _stack(recording: Recording, forces: Sequence[Forces]) -> np.ndarray:
+    return np.column_stack([column(recording, one) for one in forces])
+
+
+def _filters(
+    blocks: Sequence[tuple[Recording, np.ndarray, np.ndarray]], prior: np.ndarray, terms: Sequence[Term]
+) -> dict[str, tuple[np.ndarray, float]]:
+    """Fit an autoregression a channel (Yule-Walker) to what effects and aliases together leave of all recordings.
+
+    What only a wrong name leaves is no noise: taken for noise it would hide the right one.
+    """
+    wide = []
+    for recording, _, d in blocks:
+        more = [forces for term in terms for forces in term.forces(recording)]
+        wide.append(np.column_stack([d, _stack(recording, more)]) if more else d)
+    precision = np.concatenate([prior, np.zeros(wide[0].shape[1] - prior.size)])
+    normal = sum((d.T @ d for d in wide), np.diag(precision))
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    normal = normal / np.outer(scale, scale) + 1e-9 * np.eye(scale.size)
+    right = sum((d.T @ z for (_, z, _), d in zip(blocks, wide, strict=True)), np.zeros(scale.size))
+    values = np.linalg.solve(normal, right / scale) / scale
+    rests = [(recording, z - d @ values) for (recording, z, _), d in zip(blocks, wide, strict=True)]
+    sums: dict[str, np.ndarray] = {}
+    counts: dict[str, float] = {}
+    for recording, rest in rests:
+        start = 0
+        for name, size in balance.channels(recording):
+            part = rest[start : start + size]
+            start += size
+            if size <= _AR_ORDER:
+                continue
+            covariance = np.array([part[: size - k] @ part[k:] for k in range(_AR_ORDER + 1)])
+            sums[name] = sums.get(name, 0.0) + covariance
+            counts[name] = counts.get(name, 0.0) + size
+    found = {}
+    for name, total in sums.items():
+        covariance = total / counts[name]
+        covariance[0] *= 1.0 + 1e-9
+        coefficients = solve_toeplitz(covariance[:-1], covariance[1:])
+        left = float(covariance[0] - coefficients @ covariance[1:])
+        found[name] = (coefficients, float(np.sqrt(max(left, 1e-300))))
+    return found
+
+
+def _white(recording: Recording, values: np.ndarray, filters: dict[str, tuple[np.ndarray, float]]) -> np.ndarray:
+    """Pass columns through each channel's filter, shape kept but for what it takes to start."""
+    start, parts = 0, []
+    for name, size in balance.channels(recording):
+        part = values[start : start + size]
+        start += size
+        if size <= _AR_ORDER:
+            continue
+        coefficients, sd = filters[name]
+        done = np.asarray(lfilter(np.concatenate([[1.0], -coefficients]), [1.0], part, axis=0))
+        parts.append(done[_AR_ORDER:] / sd)
+    return np.concatenate(parts)
+
+
+def _scatter(white: Sequence[tuple[np.ndarray, np.ndarray]], values: np.ndarray, count: int) -> np.ndarray:
+    """Return by how much more than noise each effect's share scatters between recordings, at least 1."""
+    found = np.ones(count)
+    for number in range(count):
+        squares = 0.0
+        for z, d in white:
+            s = d[:, values.size - count + number]
+            energy = float(s @ s)
+            squares += float(s @ (z - d @ values)) ** 2 / energy if energy > 0.0 else 0.0
+        found[number] = max(1.0, np.sqrt(squares / max(len(white) - 1, 1)))
+    return found
+
+
+def _share_sd(d: np.ndarray, s: np.ndarray, covariance: np.ndarray, scatter: float) -> float:
+    """Return the standard deviation of an effect's share on a new recording."""
+    energy = float(s @ s)
+    along = d.T @ s / energy
+    return scatter * float(np.sqrt(1.0 / energy + along @ covariance @ along))
+
+
+def _free_energy(d: np.ndarray, place: int, covariance: np.ndarray, first: int) -> float:
+    """Return the energy of one column that errors of the known parameters can't take over."""
+    s, b = d[:, place], d[:, :first]
+    inner = np.linalg.inv(covariance[:first, :first]) + b.T @ b
+    along = b.T @ s
+    return max(float(s @ s - along @ np.linalg.solve(inner, along)), 0.0)
+
+
+def _surprise(rest: np.ndarray, d: np.ndarray, covariance: np.ndarray) -> float:
+    """Return minus twice the log-likelihood of a new recording under a model that others were fitted to."""
+    inner = np.linalg.inv(covariance) + d.T @ d
+    along = d.T @ rest
+    sign, size = np.linalg.slogdet(inner @ covariance)
+    return float(rest @ rest - along @ np.linalg.solve(inner, along) + (size if sign > 0 else 0.0))
+
+
+def _size(recording: Recording, effect: Named) -> tuple[str, float]:
+    """Return (unit, rms) of what an effect adds along a motion: a force, or the error of a reading."""
+    known = CATALOGUE[effect.name]
+    values = _mean_values(effect)
+    forces = balance.effect_forces(recording, known, effect.acts_on, [values[name] for name in known.parameters])
+    if effect.acts_on.endswith("_sensor"):
+        error_m = forces.macro_sensor_m if forces.macro_sensor_m is not None else forces.end_sensor_m
+        return "m", _rms(error_m)
+    own = forces.end_n if effect.acts_on.startswith("micro") else forces.macro_n
+    return "N", _rms(own)
+
+
+def _rms(values: np.ndarray | None) -> float:
+    return 0.0 if values is None else float(np.sqrt(np.mean(values * values)))
+
+
+def _rivals(
+    one: Named,
+    named: Sequence[Named],
+    terms: Sequence[Term],
+    base_columns: Callable[[Recording], np.ndarray],
+    prior: np.ndarray,
+    base_values: np.ndarray,
+    blocks: Sequence[tuple[Recording, np.ndarray, np.ndarray]],
+    filters: dict[str, tuple[np.ndarray, float]],
+) -> dict[tuple[str, str], _Model]:
+    """Fit each alias of an effect in its place, at the shape that suits the recordings best."""
+    wanted = {(name, place) for name, place, _ in one.aliases}
+    if not wanted:
+        return {}
+    others = [effect for effect in named if effect is not one]
+    best: dict[tuple[str, str], tuple[float, _Model]] = {}
+    for term in terms:
+        if term.key not in wanted or term.scope == "run":
+            continue
+
+        def columns(recording: Recording, rest: np.ndarray, term: Term = term) -> np.ndarray:
+            found = base_columns(recording)
+            free = rest - found @ base_values
+            fixed = _effect_columns(recording, others, free) if others else []
+            return np.column_stack([found, *fixed, _stack(recording, term.forces(recording))])
+
+        white = [(_white(r, z, filters), _white(r, columns(r, z), filters)) for r, z, _ in blocks]
+        precision = np.concatenate([prior[: base_values.size], np.zeros(white[0][1].shape[1] - base_values.size)])
+        normal = sum((d.T @ d for _, d in white), np.diag(precision))
+        normal += 1e-9 * np.diag(np.diag(normal))
+        right = sum((d.T @ z for z, d in white), np.zeros(precision.size))
+        values = np.linalg.solve(normal, right)
+        gain = float(right @ values)
+        if term.key not in best or gain > best[term.key][0]:
+            best[term.key] = (gain, _Model(columns, values, np.linalg.inv(normal)))
+    return {key: model for key, (_, model) in best.items()}
+
+
+def _separation(
+    recording: Recording, seen: Evidence, base: np.ndarray, s: np.ndarray, rival: _Model, planned: np.ndarray
+) -> float:
+    """Return d' between an effect as found and its best rival, after what known parameters may take over."""
+    other = _white(recording, rival.columns(recording, planned), seen.filters)
+    first = base.shape[1]
+    mine = s + base @ seen.base_values
+    apart = mine - other @ rival.values
+    # Other effects stand on both sides with about the same values: they cancel.
+    for number in range(other.shape[1]):
+        if first <= number < first + len(seen.named) - 1:
+            apart = apart + other[:, number] * rival.values[number]
+    inner = np.linalg.inv(seen.model.covariance[:first, :first]) + base.T @ base
+    along = base.T @ apart
+    return float(np.sqrt(max(float(apart @ apart - along @ np.linalg.solve(inner, along)), 0.0)))
+
+
+def with_outcomes(findings: Findings, outcomes: Sequence[Outcome]) -> Findings:
+    """Return findings in which what held is confirmed, without the aliases that the run ruled out."""
+    by_key = {(one.name, one.acts_on): one for one in outcomes}
+    named = []
+    for effect in findings.named:
+        outcome = by_key.get((effect.name, effect.acts_on))
+        if outcome is None:
+            named.append(effect)
+            continue
+        out = {(name, place) for name, place, _ in outcome.out}
+        aliases = tuple(alias for alias in effect.aliases if alias[:2] not in out)
+        named.append(replace(effect, confirmed=outcome.confirmed, aliases=aliases))
+    return replace(findings, named=tuple(named))
