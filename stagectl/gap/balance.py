@@ -15,7 +15,7 @@ from stagectl.gap import innovations
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
-from stagectl.gap.motion import PARTS_COUNT, Motion, delayed, driven, lagged, lagged_at_samples, motion_of
+from stagectl.gap.motion import PARTS_COUNT, Motion, delayed, driven, lagged, lagged_at_samples, motion_of, motion_under
 
 AXES = ("macro", "end")
 """Bodies; the second one is the micro's, its position the end's."""
@@ -104,18 +104,33 @@ class Recording:
 
 def recording_of(log: Log, believed: Believed) -> Recording:
     """Prepare a log: motion, commands on parts of intervals, contact geometry."""
+    rough = _recording(log, believed, motion_of(log.macro_position_m, log.period_s, believed.macro.noise_m), None)
+    forces = known_forces(rough)
+    motions: list[Motion | None] = [None, None]
+    for k, (axis, force_n) in enumerate(zip(AXES, (forces.macro_n, forces.end_n), strict=True)):
+        if axis in rough.axes and force_n is not None:
+            motions[k] = motion_under(
+                rough.motion(axis), rough.position_m(axis), log.valid, force_n, rough.mass_kg(axis),
+                log.period_s, rough.belief(axis).noise_m,
+            )  # fmt: skip
+    return _recording(log, believed, motions[0] or rough.macro, motions[1])
+
+
+def _recording(log: Log, believed: Believed, macro: Motion, end: Motion | None) -> Recording:
+    """Put together what is known along a motion; without one of the end, its own is made of the positions alone."""
     h = log.period_s
-    macro = motion_of(log.macro_position_m, h, believed.macro.noise_m)
     macro_n, macro_at_n = driven(log.macro_command_n, believed.macro.latch_s, believed.macro.current_loop_s, h)
     at_samples_n = {"macro": macro_at_n}
-    end = micro_n = depth = depth_rate = side = None
+    micro_n = depth = depth_rate = side = None
     if log.end_position_m is not None and log.micro_command_n is not None and believed.micro is not None:
-        end = motion_of(log.end_position_m, h, believed.micro.noise_m)
+        end = end or motion_of(log.end_position_m, h, believed.micro.noise_m)
         micro_n, at_samples_n["end"] = driven(
             log.micro_command_n, believed.micro.latch_s, believed.micro.current_loop_s, h
         )
         if believed.joint is not None:
             side, depth, depth_rate = _contact(believed, believed.joint, macro, end)
+    else:
+        end = None
     recording = Recording(log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {})
     for axis, reported_a in (("macro", log.macro_current_a), ("end", log.micro_current_a)):
         if axis in recording.axes and reported_a is not None and recording.belief(axis).current_noise_a is not None:
