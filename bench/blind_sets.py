@@ -385,9 +385,8 @@ def summary_lines(all_marked: Sequence[Marked]) -> list[str]:
             f"{row['figure']:<12} {row['right']:>3}/{row['count']:<3} {share} "
             f"({100 * low:.0f} to {100 * high:.0f} %), bar {100 * row['bar']:.0f} % {verdict}"
         )
-    for name in ("parameter_error_median", "coverage", "mean_set_size", "mean_own_set_size"):
-        if result[name] is not None:
-            lines.append(f"{name.replace('_', ' ')}: {result[name]:.3g}")
+    means = ("parameter_error_median", "coverage", "mean_set_size", "mean_own_set_size")
+    lines += [f"{name.replace('_', ' ')}: {result[name]:.3g}" for name in means if result[name] is not None]
     lines.append(f"reducible gap closed: {closed_text(all_marked)}")
     for name, row in result["by_name"].items():
         lines.append(
