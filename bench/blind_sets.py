@@ -267,10 +267,15 @@ def search(job: Job) -> Searched:
         return Searched(job.seed, truth, NOTHING, 0, (0.0, 0.0), 0.0, time.monotonic() - begin_s, text)
 
 
-def searched(jobs: Sequence[Job], workers: int) -> Iterator[Searched]:
-    """Search sets, each in a process of its own pool, in the order in which they end."""
+def searched(jobs: Sequence[Job], workers: int, until_s: float = float("inf")) -> Iterator[Searched]:
+    """Search sets, each in a process of its own pool, in the order in which they end.
+
+    What has not begun at `until_s` of the monotonic clock is left out; sets begin in the order given.
+    """
     if workers <= 1:
-        yield from map(search, jobs)
+        for job in jobs:
+            if time.monotonic() < until_s:
+                yield search(job)
         return
     for name in _THREADS:  # heard by the workers: they must not fight for the processors
         os.environ.setdefault(name, str(max(1, (os.cpu_count() or 1) // workers)))
@@ -278,6 +283,11 @@ def searched(jobs: Sequence[Job], workers: int) -> Iterator[Searched]:
     with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
         waiting = {pool.submit(search, job): job for job in jobs}
         for future in concurrent.futures.as_completed(waiting):
+            if time.monotonic() >= until_s:
+                for other in waiting:
+                    other.cancel()
+            if future.cancelled():
+                continue
             job = waiting[future]
             try:
                 yield future.result()
