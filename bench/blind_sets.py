@@ -85,6 +85,7 @@ def _log(run: dict[str, Any], table: dict[str, np.ndarray], period_s: float) -> 
         reference_m=table["reference_m"],
         macro_payload_kg=payload["macro"],
         end_payload_kg=payload["end"],
+        start_s=run["starts_at_session_s"],
         macro_current_a=table["macro_current_a"],
         micro_current_a=table.get("micro_current_a"),
     )
@@ -115,6 +116,12 @@ def _believed(name: str, modeller: dict[str, Any]) -> Believed:
             latch_s=values[f"{side}_command_delay_s"],
             latch_sd_s=sds[f"{side}_command_delay_s"],
             current_loop_sd_s=sds[f"{side}_current_lag_s"],
+            current_noise_a=float(
+                np.hypot(
+                    modeller["sensors"][f"{side}_current_noise_a"],
+                    modeller["sensors"][f"{side}_current_quantum_a"] / np.sqrt(12.0),
+                )
+            ),
         )
 
     joint = None

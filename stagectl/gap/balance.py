@@ -11,10 +11,10 @@ import numpy as np
 from stagectl import compose
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap import innovations
-from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
-from stagectl.gap.motion import PARTS_COUNT, Motion, delayed, lagged, motion_of
+from stagectl.gap.motion import PARTS_COUNT, Motion, delayed, driven, lagged, lagged_at_samples, motion_of
 
 AXES = ("macro", "end")
 """Bodies; the second one is the micro's, its position the end's."""
@@ -31,6 +31,8 @@ class Forces:
     end_n: np.ndarray | None = None
     macro_sensor_m: np.ndarray | None = None
     end_sensor_m: np.ndarray | None = None
+    macro_current_a: np.ndarray | None = None  # at the samples, shape (n,)
+    end_current_a: np.ndarray | None = None
 
 
 @dataclass(slots=True)
@@ -49,11 +51,17 @@ class Recording:
     filters: dict[str, tuple[Noise, np.ndarray, np.ndarray]]
     judged: dict[str, np.ndarray]
     known: dict[tuple[str, str], dict[str, np.ndarray]]  # quantities by axis and kind of place, once asked for
+    reported_a: dict[str, np.ndarray]  # reported minus believed current at the samples, by axis, where it is known
 
     @property
     def axes(self) -> tuple[str, ...]:
         """Bodies that this log has."""
         return AXES if self.end is not None else AXES[:1]
+
+    @property
+    def reaction_ratio(self) -> float:
+        """Share of the micro's motor force that is believed to push the macro back."""
+        return sum(row["fraction_ratio"] for row in self.believed.effects if row["name"] == "micro_reaction")
 
     def motion(self, axis: str) -> Motion:
         """Motion of one body."""
@@ -96,19 +104,36 @@ def recording_of(log: Log, believed: Believed) -> Recording:
     """Prepare a log: motion, commands on parts of intervals, contact geometry."""
     h = log.period_s
     macro = motion_of(log.macro_position_m, h, believed.macro.noise_m)
-    macro_n = lagged(delayed(log.macro_command_n, believed.macro.latch_s / h), believed.macro.current_loop_s, h)
+    macro_n, macro_at_n = driven(log.macro_command_n, believed.macro.latch_s, believed.macro.current_loop_s, h)
+    at_samples_n = {"macro": macro_at_n}
     end = micro_n = depth = depth_rate = side = None
     if log.end_position_m is not None and log.micro_command_n is not None and believed.micro is not None:
         end = motion_of(log.end_position_m, h, believed.micro.noise_m)
-        micro_n = lagged(delayed(log.micro_command_n, believed.micro.latch_s / h), believed.micro.current_loop_s, h)
-        joint = believed.joint
-        if joint is not None:
-            x_b = macro.position_m - end.position_m
-            rate = macro.velocity_m_per_s - end.velocity_m_per_s
-            side = np.where(x_b > joint.right_m, 1.0, np.where(x_b < -joint.left_m, -1.0, 0.0))
-            depth = np.where(side > 0.0, x_b - joint.right_m, np.where(side < 0.0, -joint.left_m - x_b, 0.0))
-            depth_rate = side * rate
-    return Recording(log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {})
+        micro_n, at_samples_n["end"] = driven(
+            log.micro_command_n, believed.micro.latch_s, believed.micro.current_loop_s, h
+        )
+        if believed.joint is not None:
+            side, depth, depth_rate = _contact(believed, believed.joint, macro, end)
+    recording = Recording(log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {})
+    for axis, reported_a in (("macro", log.macro_current_a), ("end", log.micro_current_a)):
+        if axis in recording.axes and reported_a is not None and recording.belief(axis).current_noise_a is not None:
+            believed_a = at_samples_n[axis] / recording.belief(axis).force_constant_n_per_a
+            recording.reported_a[axis] = reported_a - believed_a
+    return recording
+
+
+def _contact(
+    believed: Believed, joint: BelievedJoint, macro: Motion, end: Motion
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (side, penetration, its rate) on parts of intervals; a contact whose damping would pull has let go."""
+    x_b = macro.position_m - end.position_m
+    side = np.where(x_b > joint.right_m, 1.0, np.where(x_b < -joint.left_m, -1.0, 0.0))
+    depth = np.where(side > 0.0, x_b - joint.right_m, np.where(side < 0.0, -joint.left_m - x_b, 0.0))
+    rate = side * (macro.velocity_m_per_s - end.velocity_m_per_s)
+    damping = sum(row["damping_n_s_per_m"] for row in believed.effects if row["name"] == "contact_damping")
+    stiffness = np.where(side > 0.0, joint.right_stiffness_n_per_m, joint.left_stiffness_n_per_m)
+    touches = stiffness * depth + damping * rate > 0.0
+    return side * touches, depth * touches, rate * touches
 
 
 def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = True) -> None:
@@ -145,8 +170,25 @@ def whitened(recording: Recording, axis: str, force_n: np.ndarray | None, positi
     return out[recording.judged[axis]]
 
 
+def channels(recording: Recording) -> list[tuple[str, int]]:
+    """Return (name, rows) of each part of a column: innovations of the bodies, then what their drives report."""
+    bodies = [(axis, int(recording.judged[axis].sum())) for axis in recording.axes]
+    return bodies + [(f"{axis}_current", int(_settled(recording).sum())) for axis in recording.reported_a]
+
+
+def observed(recording: Recording) -> np.ndarray:
+    """Return the innovations of all channels under what is believed."""
+    known = known_forces(recording)
+    parts = [
+        whitened(recording, axis, known.macro_n if axis == "macro" else known.end_n, recording.position_m(axis))
+        for axis in recording.axes
+    ]
+    parts += [_scaled(recording, axis, reported_a) for axis, reported_a in recording.reported_a.items()]
+    return np.concatenate(parts)
+
+
 def column(recording: Recording, forces: Forces) -> np.ndarray:
-    """Return what forces and sensor errors that the filter knows nothing of add to the innovations of all bodies."""
+    """Return what forces and errors that the filter knows nothing of add to the innovations of all channels."""
     parts = []
     for axis, force_n, sensor_m in (
         ("macro", forces.macro_n, forces.macro_sensor_m),
@@ -157,7 +199,26 @@ def column(recording: Recording, forces: Forces) -> np.ndarray:
                 parts.append(np.zeros(int(recording.judged[axis].sum())))
             else:
                 parts.append(whitened(recording, axis, None if force_n is None else -force_n, sensor_m))
+    for axis in recording.reported_a:
+        current_a = forces.macro_current_a if axis == "macro" else forces.end_current_a
+        parts.append(
+            _scaled(recording, axis, np.zeros(recording.log.samples_count) if current_a is None else current_a)
+        )
     return np.concatenate(parts)
+
+
+def _settled(recording: Recording) -> np.ndarray:
+    """Tell at which samples reported currents count."""
+    judged = recording.log.valid.copy()
+    judged[: round(_SETTLE_S / recording.log.period_s)] = False
+    return judged
+
+
+def _scaled(recording: Recording, axis: str, current_a: np.ndarray) -> np.ndarray:
+    noise_a = recording.belief(axis).current_noise_a
+    if noise_a is None:
+        raise KeyError(axis)
+    return (current_a / noise_a)[_settled(recording)]
 
 
 def known_forces(recording: Recording) -> Forces:
@@ -190,7 +251,7 @@ def joint_force_n(recording: Recording) -> np.ndarray:
 
 def add(total: Forces, more: Forces) -> None:
     """Add forces to forces, in place."""
-    for name in ("macro_n", "end_n", "macro_sensor_m", "end_sensor_m"):
+    for name in ("macro_n", "end_n", "macro_sensor_m", "end_sensor_m", "macro_current_a", "end_current_a"):
         extra = getattr(more, name)
         if extra is not None:
             held = getattr(total, name)
@@ -226,7 +287,9 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
         "command_a": recording.held_command_n(axis) / recording.force_constant_n_per_a(axis),
         "micro_motor_force_n": 0.0 * whole if recording.micro_command_n is None else recording.micro_command_n,
         "mass_kg": recording.mass_kg(axis) * whole,
-        "t_s": recording.log.times_s[:, None] + (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * h,
+        "t_s": recording.log.start_s
+        + recording.log.times_s[:, None]
+        + (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * h,
         "dt_s": h / PARTS_COUNT * whole,
     }
     if kind == "sensor":  # a reading is of the sample's instant, which begins its interval
@@ -273,8 +336,23 @@ def effect_forces(recording: Recording, effect: Effect, place: str, parameters: 
         return _misread(recording, axis, value)
     if place.endswith("_command"):
         belief = recording.belief(axis)
-        value = lagged(value * belief.force_constant_n_per_a, belief.current_loop_s, recording.log.period_s)
+        return motor_forces(
+            recording,
+            axis,
+            lagged(value * belief.force_constant_n_per_a, belief.current_loop_s, recording.log.period_s),
+            lagged_at_samples(value, belief.current_loop_s, recording.log.period_s),
+        )
+    if place.endswith("_actuator"):
+        return motor_forces(recording, axis, value, None)
     return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
+
+
+def motor_forces(recording: Recording, axis: str, force_n: np.ndarray, current_a: np.ndarray | None) -> Forces:
+    """Put a change of one motor's force where it acts: the micro's pushes the macro back as well."""
+    if axis == "macro":
+        return Forces(macro_n=force_n, macro_current_a=current_a)
+    reaction = recording.reaction_ratio
+    return Forces(macro_n=-reaction * force_n if reaction else None, end_n=force_n, end_current_a=current_a)
 
 
 def _misread(recording: Recording, axis: str, error_m: np.ndarray) -> Forces:

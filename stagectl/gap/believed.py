@@ -47,6 +47,7 @@ class BelievedAxis:
     latch_s: float = 0.0  # sample instant -> the drive takes over the command of the same row
     latch_sd_s: float = LATCH_SD_S
     current_loop_sd_s: float = CURRENT_LOOP_SD_S
+    current_noise_a: float | None = None  # of the drive's reported current; None: what it reports is not used
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import numpy as np
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap import balance
 from stagectl.gap.balance import Forces, Recording
-from stagectl.gap.motion import delayed, lagged
+from stagectl.gap.motion import driven
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +70,9 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
     known("macro_force_constant", believed.macro.force_constant_sd_ratio, lambda r: Forces(macro_n=r.macro_command_n))
     if believed.micro is not None and recording.end is not None:
         known("micro_mass_kg", believed.micro.mass_sd_kg / believed.micro.mass_kg, inertia("end"))
-        reaction = sum(row["fraction_ratio"] for row in believed.effects if row["name"] == "micro_reaction")
 
         def micro_motor(r: Recording) -> Forces:
-            force_n = r.micro_command_n
-            return Forces(macro_n=None if force_n is None or not reaction else -reaction * force_n, end_n=force_n)
+            return Forces() if r.micro_command_n is None else balance.motor_forces(r, "end", r.micro_command_n, None)
 
         known("micro_force_constant", believed.micro.force_constant_sd_ratio, micro_motor)
     if joint is not None and recording.end is not None:
@@ -123,17 +121,13 @@ def _timing(name: str, axis: str, lag_s: float) -> Term:
         command_n = r.log.macro_command_n if axis == "macro" else r.log.micro_command_n
         if command_n is None:
             return [Forces()]
+        latch_s, loop_s = belief.latch_s, belief.current_loop_s
+
         step_s = _TIMING_STEP_S
-        now = lagged(delayed(command_n, belief.latch_s / h), belief.current_loop_s, h)
-        if lag_s:
-            later = lagged(delayed(command_n, belief.latch_s / h), belief.current_loop_s + step_s, h)
-        else:
-            later = lagged(delayed(command_n, (belief.latch_s + step_s) / h), belief.current_loop_s, h)
-        slope = (later - now) / step_s
-        if axis == "macro":
-            return [Forces(macro_n=slope)]
-        reaction = sum(row["fraction_ratio"] for row in r.believed.effects if row["name"] == "micro_reaction")
-        return [Forces(macro_n=-reaction * slope if reaction else None, end_n=slope)]
+        now = driven(command_n, latch_s, loop_s, h)
+        later = driven(command_n, latch_s + (0.0 if lag_s else step_s), loop_s + (step_s if lag_s else 0.0), h)
+        slope, slope_at = ((after - before) / step_s for before, after in zip(now, later, strict=True))
+        return [balance.motor_forces(r, axis, slope, slope_at / belief.force_constant_n_per_a)]
 
     return Term(name, "parameter", {}, ("error_s",), forces)
 

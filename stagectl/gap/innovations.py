@@ -1,11 +1,13 @@
 """Whitening: what a mass on known forces is off from its measured position, as independent numbers of unit variance.
 
-    m x'' = f + d,    d' = -w d + noise,    y = x + n
+    m x'' = f + d,    d' = w (e - d),    e' = -w e + noise,    y = x + n
 
-A Kalman filter of (x, v, d) predicts each sample from the ones before; d stands for the slow force that nobody
-models, n for the sensor. With recorded commands as input, whatever controller ran, the innovations hold all that the
-positions say of the forces (prediction-error method, Ljung 1999, 7). The filter is linear: the innovations of
-f0 + a f1 are those of f0 plus a times those of f1 alone, which makes every effect a column of a regression.
+A Kalman filter of (x, v, d, e) predicts each sample from the ones before; d stands for the slow force that nobody
+models, n for the sensor. The slow force passes two low-passes: with one it would be believed to have thirty times its
+power at 20 Hz, and hide every friction there. With recorded commands as input, whatever controller ran, the
+innovations hold all that the positions say of the forces (prediction-error method, Ljung 1999, 7). The filter is
+linear: the innovations of f0 + a f1 are those of f0 plus a times those of f1 alone, which makes every effect a column
+of a regression.
 
 Forces come as two numbers a sample interval: their mean, and their mean weighted towards the interval's beginning,
 (2 / h^2) integral of (h - s) f(s) ds, which is what moves the position. Pure; knows no clock.
@@ -18,11 +20,12 @@ import numpy as np
 from stagectl.compiled import compiled
 
 _START_SD = (1e-6, 1e-2)  # of position and velocity before the first sample, m and m/s
+_STATES = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """What the filter believes of an axis: sensor, and the force that nobody models (Gauss-Markov)."""
+    """What the filter believes of an axis: sensor, and the force that nobody models (Gauss-Markov, second order)."""
 
     sensor_m: float
     force_n: float
@@ -32,29 +35,50 @@ class Noise:
 
 @compiled
 def gains(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, white_force_n, loose_force_n):
-    """Return (gains (n, 3), innovation variances (n,)); `loose` intervals feel an unknown force of `loose_force_n`."""
+    """Return (gains (n, 4), innovation variances (n,)); `loose` intervals feel an unknown force of `loose_force_n`."""
     n = valid.size
-    gain = np.zeros((n, 3))
+    gain = np.zeros((n, _STATES))
     variance = np.zeros(n)
     h = period_s
-    decay = np.exp(-corner_rad_per_s * h)
-    drive = force_n * force_n * (1.0 - decay * decay)
-    a = np.array([[1.0, h, 0.5 * h * h / mass_kg], [0.0, 1.0, h / mass_kg], [0.0, 0.0, decay]])
-    p = np.zeros((3, 3))
+    turn = corner_rad_per_s * h
+    decay = np.exp(-turn)
+    a = np.zeros((_STATES, _STATES))
+    a[0] = np.array([1.0, h, 0.5 * h * h / mass_kg, 0.0])
+    a[1] = np.array([0.0, 1.0, h / mass_kg, 0.0])
+    a[2] = np.array([0.0, 0.0, decay, decay * turn])
+    a[3] = np.array([0.0, 0.0, 0.0, decay])
+    steady = np.zeros((_STATES, _STATES))  # of the slow force: var e = 2 var d, and their covariance var d
+    steady[2, 2] = force_n * force_n
+    steady[2, 3] = steady[3, 2] = steady[2, 2]
+    steady[3, 3] = 2.0 * steady[2, 2]
+    moved = a @ steady @ a.T
+    drive = np.zeros((_STATES, _STATES))
+    drive[2:, 2:] = steady[2:, 2:] - moved[2:, 2:]
+    p = steady.copy()
     p[0, 0] = _START_SD[0] ** 2 + sensor_m * sensor_m
     p[1, 1] = _START_SD[1] ** 2
-    p[2, 2] = force_n * force_n
+    half = np.zeros((_STATES, _STATES))
     for k in range(n):
         variance[k] = p[0, 0] + sensor_m * sensor_m
         if valid[k]:
-            for i in range(3):
+            for i in range(_STATES):
                 gain[k, i] = p[i, 0] / variance[k]
             row = p[0].copy()
-            for i in range(3):
-                for j in range(3):
+            for i in range(_STATES):
+                for j in range(_STATES):
                     p[i, j] -= gain[k, i] * row[j]
-        p = a @ p @ a.T
-        p[2, 2] += drive
+        for i in range(_STATES):
+            for j in range(_STATES):
+                total = 0.0
+                for c in range(i, _STATES):  # a is upper triangular
+                    total += a[i, c] * p[c, j]
+                half[i, j] = total
+        for i in range(_STATES):
+            for j in range(_STATES):
+                total = drive[i, j]
+                for c in range(j, _STATES):
+                    total += half[i, c] * a[j, c]
+                p[i, j] = total
         white = white_force_n + (loose_force_n if loose[k] else 0.0)
         q = (white / mass_kg) ** 2
         p[0, 0] += 0.25 * q * h**4
@@ -73,7 +97,9 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
     x = start_m
     v = 0.0
     d = 0.0
-    decay = np.exp(-corner_rad_per_s * h)
+    e = 0.0
+    turn = corner_rad_per_s * h
+    decay = np.exp(-turn)
     for k in range(n):
         z = position_m[k] - x
         if gain[k, 0] != 0.0:
@@ -81,9 +107,11 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
         x += gain[k, 0] * z
         v += gain[k, 1] * z
         d += gain[k, 2] * z
+        e += gain[k, 3] * z
         x += v * h + 0.5 * h * h * (early_n[k] + d) / mass_kg
         v += h * (mean_n[k] + d) / mass_kg
-        d *= decay
+        d = decay * (d + turn * e)
+        e *= decay
     return out
 
 

@@ -46,6 +46,7 @@ class Log:
     end_payload_kg: float = 0.0
     macro_current_a: np.ndarray | None = None  # as the drive reports it at the sample
     micro_current_a: np.ndarray | None = None
+    start_s: float = 0.0  # since the machine was switched on, or since its first recording: drift and wear know no runs
     remarks: tuple[str, ...] = field(default=())
 
     @property

@@ -7,15 +7,19 @@ an interval, and reversals and standstill themselves are left to the simulation 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter, savgol_filter
+from scipy.signal import lfilter, savgol_coeffs, savgol_filter
 
 PARTS_COUNT = 4
 """Parts of a sample interval: friction on whole milliseconds left 57 times its noise, on quarters 8 (prototype)."""
 
 _WINDOW = 21
 _ORDER = 3
-_SLOW_SHARE = 0.02
-"""Of the peak speed: below it the sign of a velocity is not trusted in the ranking stage."""
+_SLOW_SDS = 6.0
+"""Below so many standard deviations the sign of a velocity is not trusted in the ranking stage."""
+
+_REST_SAMPLES = 10
+_REST_REACH = 12
+"""A stage that sticks leaves with a kink, which smoothing spreads over half its window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,35 +47,87 @@ def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motio
     acceleration = between(a)
     position = between(x) + bow * acceleration
     velocity = between(v)
-    noise_m_per_s = 3.0 * sensor_m / (period_s * _WINDOW**1.5) * 3.5
-    limit = max(_SLOW_SHARE * float(np.max(np.abs(v))), 3.0 * noise_m_per_s)
-    slow = np.min(np.abs(velocity), axis=1) < limit
-    wide = np.convolve(slow, np.ones(5), "same") > 0.0
+    weights = savgol_coeffs(_WINDOW, _ORDER, deriv=1, delta=period_s)
+    sd_m_per_s = sensor_m * float(np.linalg.norm(weights))
+    slow = np.min(np.abs(velocity), axis=1) < _SLOW_SDS * sd_m_per_s
+    rests = np.convolve(slow, np.ones(_REST_SAMPLES), "same") >= _REST_SAMPLES
+    wide = (np.convolve(slow, np.ones(3), "same") > 0.5) | (
+        np.convolve(rests, np.ones(2 * _REST_REACH + 1), "same") > 0.5
+    )
     return Motion(position, velocity, acceleration, wide)
 
 
-def delayed(command: np.ndarray, latch_ratio: float) -> np.ndarray:
+def delayed(command: np.ndarray, latch_ratio: float, parts: int = PARTS_COUNT) -> np.ndarray:
     """Return a held command on parts of intervals, (n, parts): it takes over `latch_ratio` periods after its sample.
 
     Before the first command acts the first is taken.
     """
-    whole = int(np.floor(latch_ratio))
-    rest = latch_ratio - whole
-    edges = np.arange(PARTS_COUNT + 1) / PARTS_COUNT
-    late = np.clip((rest - edges[:-1]) * PARTS_COUNT, 0.0, 1.0)  # share of a part in which the earlier still acts
-    index = np.arange(command.size) - whole
-    now, before = command[np.clip(index, 0, command.size - 1)], command[np.clip(index - 1, 0, command.size - 1)]
+    now, before, rest = _held(command, latch_ratio)
+    edges = np.arange(parts + 1) / parts
+    late = np.clip((rest - edges[:-1]) * parts, 0.0, 1.0)  # share of a part in which the earlier still acts
     return before[:, None] * late[None, :] + now[:, None] * (1.0 - late)[None, :]
+
+
+def _held(command: np.ndarray, latch_ratio: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return, by interval, the command that takes over, the one before, and when, as a share of the interval."""
+    whole = int(np.floor(latch_ratio))
+    index = np.arange(command.size) - whole
+    last = command.size - 1
+    return command[np.clip(index, 0, last)], command[np.clip(index - 1, 0, last)], latch_ratio - whole
+
+
+def driven(command: np.ndarray, latch_s: float, lag_s: float, period_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a drive makes of held commands: means over parts of intervals (n, parts), values at samples (n,).
+
+    A command takes over `latch_s` after its sample and passes a first-order lag, exactly: with commands averaged over
+    parts the current was off by a fiftieth of each step at the next sample, which looks like 40 us of delay.
+    """
+    now, before, rest = _held(command, latch_s / period_s)
+    if not lag_s > 0.0:
+        held = delayed(command, latch_s / period_s)
+        return held, np.where(rest > 0.0, before, now)
+    latch, whole = np.exp(-rest * period_s / lag_s), np.exp(-period_s / lag_s)
+    after = np.exp(-(1.0 - rest) * period_s / lag_s)
+    gained = now * (1.0 - after) + before * (after - whole)
+    ends = np.asarray(lfilter([1.0], [1.0, -whole], gained, zi=[whole * command[0]])[0])
+    starts = np.concatenate([command[:1], ends[:-1]])
+    at_latch = before + (starts - before) * latch
+    edges = np.arange(PARTS_COUNT + 1) / PARTS_COUNT
+    means = np.empty((command.size, PARTS_COUNT))
+    for part in range(PARTS_COUNT):
+        low, high = edges[part], edges[part + 1]
+        turn = min(max(rest, low), high)
+        means[:, part] = _area(starts, before, low, turn, 0.0, lag_s / period_s)
+        means[:, part] += _area(at_latch, now, turn, high, rest, lag_s / period_s)
+    return means * PARTS_COUNT, starts
+
+
+def _area(start: np.ndarray, goal: np.ndarray, low: float, high: float, origin: float, lag: float) -> np.ndarray:
+    """Integrate goal + (start - goal) exp(-(s - origin) / lag) from low to high."""
+    if not high > low:
+        return np.zeros_like(goal)
+    fading = lag * (np.exp(-(low - origin) / lag) - np.exp(-(high - origin) / lag))
+    return goal * (high - low) + (start - goal) * fading
 
 
 def lagged(fine: np.ndarray, lag_s: float, period_s: float) -> np.ndarray:
     """Pass held forces on parts through a first-order lag (the current loop), shape kept."""
     if lag_s <= 0.0:
         return fine
-    flat = fine.ravel()
     dt_s = period_s / fine.shape[1]
-    decay = float(np.exp(-dt_s / lag_s))
-    mean_share = (1.0 - decay) * lag_s / dt_s
+    mean_share = -float(np.expm1(-dt_s / lag_s)) * lag_s / dt_s
+    starts = _starts(fine, lag_s, dt_s)
+    return fine + (starts - fine) * mean_share
+
+
+def lagged_at_samples(fine: np.ndarray, lag_s: float, period_s: float) -> np.ndarray:
+    """Return what a first-order lag makes of held values at the sample instants, shape (n,)."""
+    return _starts(fine, lag_s, period_s / fine.shape[1])[:, 0]
+
+
+def _starts(fine: np.ndarray, lag_s: float, dt_s: float) -> np.ndarray:
+    """Return the lag's output at the beginning of each part."""
+    flat = fine.ravel()
+    decay = float(np.exp(-dt_s / lag_s)) if lag_s > 0.0 else 0.0
     ends = lfilter([1.0 - decay], [1.0, -decay], flat, zi=[decay * flat[0]])[0]
-    starts = np.concatenate([[flat[0]], ends[:-1]])
-    return (flat + (starts - flat) * mean_share).reshape(fine.shape)
+    return np.concatenate([[flat[0]], ends[:-1]]).reshape(fine.shape)

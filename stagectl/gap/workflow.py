@@ -23,7 +23,7 @@ from stagectl.gap.selection import Group, Judge, Solution, Sums, solve
 
 _AR_ORDER = 12
 _REST_PASSES = 3
-_CORNER_RAD_PER_S = 2.0 * np.pi * 2.0
+_CORNER_RAD_PER_S = 2.0 * np.pi * 1.34
 _FORCE_N = 0.05
 _EXCITED_GAIN = 1e-6
 _PARAMETER_SDS = 3.0  # beyond so many stated standard deviations a known parameter counts as wrong
@@ -230,16 +230,7 @@ def _periodic_terms(
 
 def _columns(recording: Recording, terms: Sequence[Term]) -> np.ndarray:
     """Return the whitened innovations and the columns of all terms, shape (m, 1 + columns)."""
-    known = balance.known_forces(recording)
-    first = np.concatenate(
-        [
-            balance.whitened(
-                recording, axis, known.macro_n if axis == "macro" else known.end_n, recording.position_m(axis)
-            )
-            for axis in recording.axes
-        ]
-    )
-    columns = [first]
+    columns = [balance.observed(recording)]
     for term in terms:
         columns += [balance.column(recording, forces) for forces in term.forces(recording)]
     return np.column_stack(columns)
@@ -260,8 +251,7 @@ def _whitened_sums(
     gram = np.zeros((z.shape[1], z.shape[1]))
     nulls = np.zeros((nulls_count, z.shape[1] - 1))
     count = 0.0
-    for axis in recording.axes:
-        size = int(recording.judged[axis].sum())
+    for _, size in balance.channels(recording):
         block = z[start : start + size]
         start += size
         rest = _rest(block, prior_sds)
