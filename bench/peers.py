@@ -284,7 +284,9 @@ def run_tool(tool: Tool, case: Case, problem: Problem) -> Outcome:
         coefficients = _spread(values / size[used], used, columns.shape[1])
         named = tuple(_named(problem, term, coefficients) for term in _keyed(problem.chosen(coefficients)))
         rows = [row for term in problem.chosen(coefficients) for row in _rows(problem, term, coefficients)]
-        return Outcome(case, named, problem.gap_n(coefficients), took_s, _closed(case, rows))
+        return Outcome(
+            case, named, problem.gap_n(coefficients), took_s, _closed(case, rows, problem.refitted(coefficients))
+        )
     except Exception as error:  # noqa: BLE001  a tool that fails on one case is a row of the table, not its end
         nan = float("nan")
         return Outcome(case, (), (nan, nan), time.monotonic() - begin_s, error=f"{type(error).__name__}: {error}")
@@ -299,13 +301,11 @@ def run_ours(case: Case, problem: Problem) -> Outcome:
     left, columns = problem.cleaned()
     own = [c for c, k in enumerate(problem.owner) if problem.terms[k].key in keys]
     coefficients = _spread(_least_squares(columns[:, own], left), own, columns.shape[1])
-    closed = tuple(
-        _force_gap_n(case, log, addition.effects_with(case.believed, findings, findings.named, log.session))
-        for log in (case.training[0], (case.held or case.training)[0])
-    )
-    return Outcome(
-        case, findings.named, problem.gap_n(coefficients), took_s, (closed[0], closed[1]), verdict=findings.verdict
-    )
+    rows = [addition.table_of(one, log.session) for log in case.training[:1] for one in findings.named]
+    again = [addition.table_of(one, log.session) for log in case.held[:1] for one in findings.named]
+    refitted = findings.refitted
+    closed = (_closed(case, rows, refitted)[0], _closed(case, again or rows, refitted)[1])
+    return Outcome(case, findings.named, problem.gap_n(coefficients), took_s, closed, verdict=findings.verdict)
 
 
 def _keyed(terms: list[Term]) -> list[Term]:
@@ -337,19 +337,27 @@ def _rows(problem: Problem, term: Term, coefficients: np.ndarray) -> Iterator[di
     yield {"name": term.name, "acts_on": term.acts_on} | values
 
 
-def _closed(case: Case, rows: list[dict[str, Any]]) -> tuple[float, float]:
-    effects = [dict(row) for row in case.believed.effects] + rows
+def _closed(case: Case, rows: list[dict[str, Any]], refitted: dict[str, float]) -> tuple[float, float]:
+    """Return the force gap of the simulated closed loop on a training and a held-out recording."""
+    effects: list[dict[str, Any]] = []
+    for row in case.believed.effects:
+        error = refitted.get(f"{row['name']} on {row['acts_on']}", 0.0)
+        effects.append({**row, **{name: row[name] * (1.0 + error) for name in CATALOGUE[row["name"]].linear}})
+    mass_ratio = 1.0 + refitted.get("macro_mass_kg", 0.0)
     first, last = case.training[0], (case.held or case.training)[0]
-    return _force_gap_n(case, first, effects), _force_gap_n(case, last, effects)
+    return (
+        _force_gap_n(case, first, effects + rows, mass_ratio),
+        _force_gap_n(case, last, effects + rows, mass_ratio),
+    )
 
 
-def _force_gap_n(case: Case, log: Log, effects: list[dict[str, Any]]) -> float:
-    """Return the force gap of the simulated closed loop; nan where no controller is known or the simulation fails."""
+def _force_gap_n(case: Case, log: Log, effects: list[dict[str, Any]], mass_ratio: float) -> float:
+    """Return the force gap of one recording; nan where no controller is known or the simulation runs away."""
     if arbiter.cannot_close(case.believed, log):
         return float("nan")
     try:
         with np.errstate(all="ignore"):
-            return arbiter.gap_of(log, arbiter.simulate(case.believed, effects, log)).command_n
+            return arbiter.gap_of(log, arbiter.simulate(case.believed, effects, log, mass_ratio)).command_n
     except (StagectlError, ValueError, FloatingPointError):
         return float("nan")
 
@@ -425,7 +433,7 @@ def row(tally: Tally) -> tuple[str, ...]:
         f"{sum(not mark['named'] for mark in outside)} of {len(outside)}",
         f"{np.median(ratios):.3g} N" if ratios else "-",
         _emps_names(real),
-        "-" if real is None else f"{real.closed_n[0]:.2f} / {real.closed_n[1]:.2f} N",
+        "-" if real is None else f"{_newtons(real.closed_n[0])} / {_newtons(real.closed_n[1])}",
         f"{np.median([one.took_s for one in tally.outcomes]):.1f} s" if tally.outcomes else "-",
         _cannot(tally),
     )
@@ -433,6 +441,10 @@ def row(tally: Tally) -> tuple[str, ...]:
 
 def _mean(counts: list[int]) -> str:
     return f"{np.mean(counts):.1f}" if counts else "-"
+
+
+def _newtons(value: float) -> str:
+    return f"{value:.2f} N" if np.isfinite(value) else "runs away"
 
 
 def _emps_names(real: Outcome | None) -> str:

@@ -46,6 +46,7 @@ class Problem:
 
     terms: tuple[Term, ...]
     owner: np.ndarray  # place of its term, each column
+    base: tuple[str, ...]  # known parameters
     base_precision: np.ndarray
     training: Side
     held: Side
@@ -60,25 +61,32 @@ class Problem:
 
     def gap_n(self, coefficients: np.ndarray) -> tuple[float, float]:
         """Return the rms force that is left on training and held-out rows, known parameters refitted on training."""
-        side = self.training
-        normal = side.base.T @ side.base + np.diag(self.base_precision)
-        base = np.linalg.solve(normal, side.base.T @ (side.left - side.columns @ coefficients))
+        base = self._base(coefficients)
         left = [
             (one.left - one.columns @ coefficients - one.base @ base) * one.scale for one in (self.training, self.held)
         ]
         return float(np.sqrt(np.mean(left[0] ** 2))), float(np.sqrt(np.mean(left[1] ** 2)))
+
+    def refitted(self, coefficients: np.ndarray) -> dict[str, float]:
+        """Return the error of every known parameter, beside these coefficients: a ratio, or metres, or seconds."""
+        return dict(zip(self.base, self._base(coefficients).tolist(), strict=True))
+
+    def _base(self, coefficients: np.ndarray) -> np.ndarray:
+        side = self.training
+        normal = side.base.T @ side.base + np.diag(self.base_precision)
+        return np.linalg.solve(normal, side.base.T @ (side.left - side.columns @ coefficients))
 
     def chosen(self, coefficients: np.ndarray) -> list[Term]:
         """Return the terms that have a coefficient."""
         return [self.terms[k] for k in sorted({int(self.owner[c]) for c in np.flatnonzero(coefficients)})]
 
     def force_laws(self) -> "Problem":
-        """Return the same rows with forces on an axis alone, those with an amplitude: no contact, drive, sensor, mode."""
+        """Return the same rows with forces on an axis alone that have an amplitude: no contact, drive, sensor, mode."""
         kept = [k for k, term in enumerate(self.terms) if term.acts_on.endswith("_force") and term.linear]
         columns = np.isin(self.owner, kept)
         sides = (replace(side, columns=side.columns[:, columns]) for side in (self.training, self.held))
         owner = np.searchsorted(kept, self.owner[columns])
-        return Problem(tuple(self.terms[k] for k in kept), owner, self.base_precision, *sides)
+        return Problem(tuple(self.terms[k] for k in kept), owner, self.base, self.base_precision, *sides)
 
 
 def problem_of(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> Problem:
@@ -98,7 +106,8 @@ def problem_of(believed: Believed, training: Sequence[Log], held: Sequence[Log])
         _side(blocks[part], more[part], scale, offset)
         for part, offset in ((slice(None, len(training)), 0), (slice(len(training), None), len(training)))
     ]
-    return Problem(tuple(terms), owner, np.array([sd**-2.0 for _, sd in base]), *sides)
+    names = tuple(term.name for term, _ in base)
+    return Problem(tuple(terms), owner, names, np.array([sd**-2.0 for _, sd in base]), *sides)
 
 
 @dataclass(frozen=True, slots=True)
