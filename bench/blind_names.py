@@ -265,6 +265,8 @@ PARAMETERS: dict[str, Key] = {
     "spring_n_per_m": ("spring_stiffness_error", "contact"),
     "left_stiffness_n_per_m": ("contact_stiffness_error", "contact"),
     "right_stiffness_n_per_m": ("contact_stiffness_error", "contact"),
+    "contact_stiffness_n_per_m": ("contact_stiffness_error", "contact"),
+    "backlash_width_m": ("backlash_width", "contact"),
     "left_m": ("backlash_width", "contact"),
     "right_m": ("backlash_width", "contact"),
 }

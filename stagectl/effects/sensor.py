@@ -73,12 +73,11 @@ def cyclic_error(position_m, first_m, second_m, wavelength_m, first_phase_rad, s
     drift_m=(-1e-3, 1e-3),
     time_constant_s=(1.0, 1e5),
     linear=("drift_m",),
-    run=("drift_m",),
     symptom="grows with time and levels off, on the reading, whatever the motion",
     reference="ISO 230-3: thermal drift of a lumped mass after a step in temperature",
 )
 def thermal_drift(t_s, drift_m, time_constant_s):
-    """Drift of a part that warms up: D (1 - exp(-t / tau)), t since the start of the run."""
+    """Drift of a part that warms up: D (1 - exp(-t / tau)), t since the machine was switched on."""
     return -drift_m * np.expm1(-t_s / time_constant_s)
 
 

@@ -317,23 +317,24 @@ def _at_samples(fine: np.ndarray, fallback: np.ndarray) -> np.ndarray:
     return starts[:, None] * np.ones((1, parts))
 
 
-def effect_forces(recording: Recording, effect: Effect, place: str, parameters: list[float]) -> Forces:
-    """Evaluate one effect along the measured motion, and put it where it acts."""
+def effect_forces(
+    recording: Recording, effect: Effect, place: str, parameters: list[float], *, whole: bool = False
+) -> Forces:
+    """Evaluate one effect along the measured motion, and put it where it acts.
+
+    What moves the joint's geometry, a sensor's error or an edge, is taken to first order, as a column of a regression
+    needs it; `whole` takes it at its size: an error of 30 um puts the stage on the other side of an edge.
+    """
     axis = "macro" if place.startswith("macro") else "end"
     known = quantities(recording, axis, place)
     value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
-    if place in ("contact", "contact_edge", "joint"):
-        if place == "joint":
-            push_n = value
-        elif recording.side is None:
-            push_n = np.zeros_like(value)
-        else:
-            push_n = recording.side * value
-            if place == "contact_edge":  # an edge further out is a joint that overlaps less
-                push_n = -push_n * known["contact_stiffness_n_per_m"]
+    if place in ("contact", "joint"):
+        push_n = value if place == "joint" else recording.side * value if recording.side is not None else 0.0 * value
         return Forces(macro_n=-push_n, end_n=push_n)
+    if place == "contact_edge":
+        return _edges_moved(recording, effect, parameters, value, whole)
     if place.endswith("_sensor"):
-        return _misread(recording, axis, value)
+        return _misread(recording, axis, value, whole)
     if place.endswith("_command"):
         belief = recording.belief(axis)
         return motor_forces(
@@ -355,18 +356,76 @@ def motor_forces(recording: Recording, axis: str, force_n: np.ndarray, current_a
     return Forces(macro_n=-reaction * force_n if reaction else None, end_n=force_n, end_current_a=current_a)
 
 
-def _misread(recording: Recording, axis: str, error_m: np.ndarray) -> Forces:
+def _edges_moved(
+    recording: Recording, effect: Effect, parameters: list[float], value: np.ndarray, whole: bool
+) -> Forces:
+    """Return what edges further out change: a joint that overlaps less."""
+    joint, end = recording.believed.joint, recording.end
+    if joint is None or end is None or recording.side is None:
+        return Forces()
+    if not whole:
+        stiffness = quantities(recording, "end", "contact_edge")["contact_stiffness_n_per_m"]
+        push_n = -recording.side * value * stiffness
+        return Forces(macro_n=-push_n, end_n=push_n)
+    out_m = {}
+    for side in (-1.0, 1.0):
+        known = quantities(recording, "end", "contact_edge") | {"contact_side_ratio": np.full_like(value, side)}
+        out_m[side] = along_motion(effect, [known[name] for name in effect.quantities], parameters)
+    x_b = recording.macro.position_m - end.position_m
+    rate = recording.macro.velocity_m_per_s - end.velocity_m_per_s
+    push_n = _contact_force_n(recording.believed, x_b, rate, out_m[-1.0], out_m[1.0])
+    push_n = push_n - _contact_force_n(recording.believed, x_b, rate, 0.0, 0.0)
+    return Forces(macro_n=-push_n, end_n=push_n)
+
+
+def _misread(recording: Recording, axis: str, error_m: np.ndarray, whole: bool) -> Forces:
     """Return what a sensor error does: to the position, and to the joint's forces that were taken at a wrong place."""
     sampled_m = np.ascontiguousarray(error_m[:, 0])
-    joint = recording.believed.joint
+    joint, end = recording.believed.joint, recording.end
     forces = Forces(macro_sensor_m=sampled_m) if axis == "macro" else Forces(end_sensor_m=sampled_m)
-    if joint is not None and recording.side is not None:
+    if joint is None or end is None or recording.side is None:
+        return forces
+    away_m = error_m if axis == "end" else -error_m  # by which end minus macro is read too large
+    if whole:
+        fine_m = _between_samples(sampled_m if axis == "end" else -sampled_m, error_m.shape[1])
+        slope = np.gradient(fine_m.ravel(), recording.log.period_s / error_m.shape[1]).reshape(error_m.shape)
+        x_b = recording.macro.position_m - end.position_m
+        rate = recording.macro.velocity_m_per_s - end.velocity_m_per_s
+        spring_n = joint.spring_n_per_m * fine_m + joint.damping_n_s_per_m * slope
+        contact_n = _contact_force_n(recording.believed, x_b + fine_m, rate + slope, 0.0, 0.0)
+        forces.end_n = spring_n + contact_n - _contact_force_n(recording.believed, x_b, rate, 0.0, 0.0)
+    else:
         left = np.where(recording.side < 0.0, joint.left_stiffness_n_per_m, 0.0)
         right = np.where(recording.side > 0.0, joint.right_stiffness_n_per_m, 0.0)
-        stiffness = joint.spring_n_per_m + left + right
-        forces.end_n = stiffness * error_m * (1.0 if axis == "end" else -1.0)
-        forces.macro_n = -forces.end_n
+        forces.end_n = (joint.spring_n_per_m + left + right) * away_m
+    forces.macro_n = -forces.end_n
     return forces
+
+
+def _between_samples(values: np.ndarray, parts: int) -> np.ndarray:
+    """Put values at samples on the middles of parts of the intervals that they begin, on straight lines."""
+    share = (np.arange(parts) + 0.5) / parts
+    following = np.concatenate([values[1:], values[-1:]])
+    return values[:, None] + share[None, :] * (following - values)[:, None]
+
+
+def _contact_force_n(
+    believed: Believed,
+    x_b: np.ndarray,
+    rate: np.ndarray,
+    left_out_m: np.ndarray | float,
+    right_out_m: np.ndarray | float,
+) -> np.ndarray:
+    """Force of the believed contact on the end at relative positions x_b = macro minus end, edges moved outward."""
+    joint = believed.joint
+    if joint is None:
+        return np.zeros_like(x_b)
+    damping = sum(row["damping_n_s_per_m"] for row in believed.effects if row["name"] == "contact_damping")
+    right_m = x_b - joint.right_m - right_out_m
+    left_m = -joint.left_m - left_out_m - x_b
+    right_n = np.where(right_m > 0.0, np.maximum(joint.right_stiffness_n_per_m * right_m + damping * rate, 0.0), 0.0)
+    left_n = np.where(left_m > 0.0, np.maximum(joint.left_stiffness_n_per_m * left_m - damping * rate, 0.0), 0.0)
+    return right_n - left_n
 
 
 def along_motion(effect: Effect, arguments: list[np.ndarray], parameters: list[float]) -> np.ndarray:

@@ -10,6 +10,27 @@ from stagectl.gap.balance import Recording
 _SMOOTHING_M_PER_S = 1e-4
 _LASER_M = 632.8e-9
 
+FREE_SHAPES: dict[str, tuple[str, ...]] = {
+    "stribeck_friction": ("stribeck_m_per_s",),
+    "sublinear_viscous_friction": ("exponent_ratio",),
+    "dahl_friction": ("slip_m",),
+    "lugre_friction": ("slip_m", "static_ratio", "stribeck_m_per_s"),
+    "cable_hysteresis": ("slip_m",),
+    "soft_contact": ("knee_m",),
+    "force_constant_saturation": ("saturation_n",),
+    "amplifier_dead_band": ("half_width_a",),
+    "current_loop_lag": ("time_constant_s",),
+    "command_delay": ("delay_s",),
+    "flexible_mode": ("frequency_hz", "damping_ratio"),
+    "sensor_delay": ("delay_s",),
+    "sensor_lag": ("time_constant_s",),
+    "thermal_drift": ("time_constant_s",),
+    "cogging": ("pitch_m",),
+    "current_ripple": ("pitch_m",),
+    "base_vibration": ("frequency_hz",),
+}
+"""Shapes that are searched beyond the grid, by effect."""
+
 Grid = dict[str, list[dict[str, float]]]
 
 
@@ -20,8 +41,8 @@ def grids_for(recordings: list[Recording]) -> Grid:
     return {
         "coulomb_friction": [smooth],
         "asymmetric_coulomb_friction": [smooth],
-        "stribeck_friction": [smooth | {"stribeck_m_per_s": v} for v in (1e-3, 3e-3, 1e-2, 3e-2, 6e-2)],
-        "sublinear_viscous_friction": [{"exponent_ratio": p} for p in (0.5, 0.65, 0.8)],
+        "stribeck_friction": [smooth | {"stribeck_m_per_s": v} for v in (5e-4, 1e-3, 3e-3, 1e-2, 3e-2, 6e-2)],
+        "sublinear_viscous_friction": [{"exponent_ratio": p} for p in (0.3, 0.45, 0.6, 0.75)],
         "load_dependent_friction": [smooth],
         "position_dependent_friction": [smooth],
         "dahl_friction": [{"slip_m": s} for s in (1e-6, 5e-6, 2e-5, 1e-4)],
@@ -31,17 +52,21 @@ def grids_for(recordings: list[Recording]) -> Grid:
         "cable_hysteresis": [{"slip_m": s} for s in (1e-3, 1e-2, 5e-2)],
         "cable_spring": [{"anchor_m": centre_m}],
         "contact_hysteresis": [{"smoothing_m_per_s": _SMOOTHING_M_PER_S}],
-        "soft_contact": [{"knee_m": k} for k in (3e-6, 6e-6, 1e-5, 2e-5)],
-        "force_constant_saturation": [{"saturation_n": s} for s in (500.0, 2000.0, 8000.0)],
+        "soft_contact": [{"knee_m": k} for k in (3e-6, 1e-5, 3e-5, 6e-5)],
+        "force_constant_saturation": [{"saturation_n": s} for s in (150.0, 400.0, 1000.0, 3000.0)],
         "amplifier_dead_band": [{"half_width_a": w} for w in (1e-3, 3e-3, 1e-2, 3e-2)],
-        "current_loop_lag": [{"time_constant_s": 1e-4}],
-        "command_delay": [{"delay_s": 1e-4}],
+        "current_loop_lag": [{"time_constant_s": t} for t in (5e-5, 2e-4, 5e-4)],
+        "command_delay": [{"delay_s": t} for t in (5e-5, 2e-4, 6e-4)],
         "flexible_mode": [
             {"share_ratio": 0.02, "frequency_hz": float(f), "damping_ratio": 0.02} for f in np.geomspace(8.0, 200.0, 14)
         ],
-        "sensor_delay": [{"delay_s": 1e-5}],
-        "sensor_lag": [{"time_constant_s": 1e-4}],
-        "cyclic_error": [{"wavelength_m": _LASER_M}],
-        "thermal_drift": [{"time_constant_s": t} for t in (5.0, 30.0, 300.0)],
-        "abbe_error": [{"centre_m": centre_m}],
+        "sensor_delay": [{"delay_s": t} for t in (1e-5, 3e-4)],
+        "sensor_lag": [{"time_constant_s": t} for t in (5e-5, 3e-4)],
+        "cyclic_error": [
+            {"wavelength_m": _LASER_M, "second_m": 0.0, "second_phase_rad": 0.0},
+            {"wavelength_m": _LASER_M, "first_m": 0.0, "first_phase_rad": 0.0},
+            {"wavelength_m": _LASER_M},
+        ],
+        "thermal_drift": [{"time_constant_s": t} for t in (20.0, 60.0, 200.0)],
+        "abbe_error": [{"centre_m": 0.0}, {"centre_m": centre_m}],
     }

@@ -40,7 +40,6 @@ AS_PARAMETERS = frozenset(
         "force_constant_error",
         "contact_stiffness_error",
         "backlash_width_change",
-        "backlash_centre_shift",
     }
 )
 """Effects that say the same as a known parameter that is wrong: `parameter_terms` has them."""
@@ -110,6 +109,44 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
     return found
 
 
+_WRONG_RATIO = 0.3
+_WRONG_M = 100e-6
+"""How far a known parameter may be off that competes with the effects, beyond what is stated."""
+
+
+def wrong_parameter_terms(recording: Recording) -> Iterator[Term]:
+    """Yield known parameters as hypotheses of their own: what is further off than its stated uncertainty allows.
+
+    Both stiffnesses of the contact alike, and both edges alike (a gap of another width), are one hypothesis each.
+    """
+    terms = {term.name: term for term, _ in parameter_terms(recording)}
+
+    def free(name: str, forces: Callable[[Recording], list[Forces]], limit: float) -> Term:
+        return Term(name, "parameter", {}, (terms_unit(name),), forces, "structural", ((-limit, limit),))
+
+    for name, term in terms.items():
+        if not name.endswith(("_s", "_m")):
+            yield free(name, term.forces, _WRONG_RATIO if not name.startswith(("contact_", "viscous_")) else 1.0)
+    for name, parts in (
+        ("contact_stiffness_n_per_m", ("left_stiffness_n_per_m", "right_stiffness_n_per_m")),
+        ("backlash_width_m", ("left_m", "right_m")),
+    ):
+        if all(part in terms for part in parts):
+
+            def both(r: Recording, parts: tuple[str, ...] = parts) -> list[Forces]:
+                total = Forces()
+                for part in parts:
+                    balance.add(total, terms[part].forces(r)[0])
+                return [total]
+
+            yield free(name, both, _WRONG_M if name.endswith("_m") else _WRONG_RATIO)
+
+
+def terms_unit(name: str) -> str:
+    """Return what the amplitude of a wrong parameter is called: metres of an edge, else a ratio."""
+    return "error_m" if name.endswith("width_m") else "error_ratio"
+
+
 _TIMING_STEP_S = 5e-6
 
 
@@ -166,6 +203,8 @@ def effect_terms(recordings: list[Recording], grids: dict[str, list[dict[str, fl
         if effect.name in AS_PARAMETERS:
             continue
         for place in effect.places:
+            if place == "micro_force" and effect.name in _ON_BOTH_AXES:
+                continue
             if not has_micro and (not place.startswith("macro") or _needs_micro(effect)):
                 continue
             if place.startswith("contact") and recordings[0].side is None:
@@ -185,9 +224,9 @@ def periodic_terms(
         for place in effect.places:
             if not place.startswith(force.removesuffix("_force")):
                 continue
-            if "pitch_m" in effect.parameters and "second_n" not in effect.parameters:
+            if "pitch_m" in effect.parameters:
                 yield from (term_of(effect, place, {"pitch_m": pitch}) for pitch in pitches_m)
-            elif effect.name == "base_vibration":
+            elif effect.name == "base_vibration" and place == "macro_force":
                 yield from (term_of(effect, place, {"frequency_hz": f}) for f in frequencies_hz)
 
 
@@ -217,9 +256,7 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
         settings, amplitudes = [dict(shape)], ["share_of_shape_ratio"]
 
     def forces(r: Recording) -> list[Forces]:
-        return [
-            balance.effect_forces(r, effect, place, [values[name] for name in effect.parameters]) for values in settings
-        ]
+        return [_everywhere(r, effect, place, [values[name] for name in effect.parameters]) for values in settings]
 
     scope = "structural"
     for tag in ("session", "run"):
@@ -231,6 +268,31 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
         else tuple(effect.bounds[name] for name in linear) or (_share_bounds(effect, shape),)
     )
     return Term(effect.name, place, dict(shape), tuple(amplitudes), forces, scope, bounds, bool(linear))
+
+
+def term_at_size(effect: Effect, place: str, parameters: dict[str, float]) -> Term:
+    """Make the term of one effect with all its parameters given; its one amplitude should come out as one."""
+    values = [parameters[name] for name in effect.parameters]
+
+    def forces(r: Recording) -> list[Forces]:
+        return [_everywhere(r, effect, place, values, whole=True)]
+
+    shape = {name: parameters[name] for name in effect.parameters}
+    scope = next((tag for tag in ("session", "run") if tag in effect.tags.values()), "structural")
+    return Term(effect.name, place, shape, ("share_of_shape_ratio",), forces, scope, (_SHARE_BOUNDS,), linear=False)
+
+
+_SHARE_BOUNDS = (0.0, 3.0)
+_ON_BOTH_AXES = ("gravity_tilt", "base_vibration")
+"""What a base does is felt by everything that stands on it."""
+
+
+def _everywhere(r: Recording, effect: Effect, place: str, values: list[float], *, whole: bool = False) -> Forces:
+    """Evaluate an effect at its place; one of the base on both bodies."""
+    forces = balance.effect_forces(r, effect, place, values, whole=whole)
+    if effect.name in _ON_BOTH_AXES and r.end is not None:
+        balance.add(forces, balance.effect_forces(r, effect, "micro_force", values))
+    return forces
 
 
 def _share_bounds(effect: Effect, shape: dict[str, float]) -> tuple[float, float]:

@@ -5,23 +5,26 @@ term stays when it gains on the recordings it was fitted on AND on recordings th
 best of the whole library gains on noise, and when it explains a share of what is reducible at all. Pure.
 """
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
 NULL_QUANTILE = 0.99
-MATERIAL_RATIO = 0.03
-"""Share of the reducible part (beyond the floor) that a term must explain, on either side."""
+MATERIAL_RATIO = 0.002
+"""Share of everything gained so far that a further hypothesis must gain: below it, laws are not that exact."""
 
-ALIAS_GAIN = 9.0
-"""Log-likelihood ratio (twice) below which two names can't be told apart: power 0.9 needs about this."""
+RIVALS_COUNT = 6
+"""Names whose shapes are searched in each round."""
 
-_ALIAS_SHARE = 0.03
+ALIAS_GAIN = 8.6
+"""Log-likelihood ratio (twice) below which two names can't be told apart: power 0.9 at 5 % false alarms."""
+
+ALIAS_SHARE = 0.002
 _JITTER = 1e-10
 _BOUND_SDS = 2.0
-_AGREE_SDS = 4.0
-_AGREE_RATIO = 0.35
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,15 +73,9 @@ class Solution:
 
 def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
     """Solve the amplitudes of `groups` on all of `sums`."""
-    slots, precision = _slots_of(groups, sums)
+    slots, precision = active_slots(groups, sums)
     size = len(slots)
-    normal = np.diag(np.array(precision)) if size else np.zeros((0, 0))
-    right = np.zeros(size)
-    for s in sums:
-        here = [k for k, (_, scope) in enumerate(slots) if _covers(scope, s)]
-        columns = [slots[k][0] for k in here]
-        normal[np.ix_(here, here)] += s.gram[np.ix_(columns, columns)]
-        right[here] += s.gram[columns, 0]
+    normal, right = normal_of(slots, precision, sums)
     if not size:
         return Solution(tuple(groups), (), np.zeros(0), np.zeros((0, 0)), 0.0)
     scale = np.sqrt(np.diag(normal))
@@ -121,21 +118,42 @@ def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
         if own:
             right = s.gram[own, 0] - s.gram[np.ix_(own, columns)] @ theta
             normal = s.gram[np.ix_(own, own)]
-            normal = normal + _JITTER * np.trace(normal) * np.eye(len(own))
+            normal = normal + (_JITTER * np.trace(normal) + 1e-300) * np.eye(len(own))
             total += float(right @ np.linalg.solve(normal, right)) - len(own)
     return total
+
+
+class Source(Protocol):
+    """Where sums come from; they grow as hypotheses get new columns."""
+
+    sums: list[Sums]
+
+
+Refine = Callable[[Sequence[Group], Group], Group]
+"""(groups beside it, a group of the grid) -> the same hypothesis at its best shape."""
 
 
 @dataclass(slots=True)
 class Judge:
     """Training recordings, recordings that no fit sees, and the library that competes."""
 
-    training: list[Sums]
-    held: list[Sums]
+    source: Source
+    training_count: int
     base: list[Group]
     library: list[Group]
+    refine: Refine
     thresholds: tuple[float, float] = (0.0, 0.0)
     trace: list[str] = field(default_factory=list)
+
+    @property
+    def training(self) -> list[Sums]:
+        """Recordings that fits may see."""
+        return self.source.sums[: self.training_count]
+
+    @property
+    def held(self) -> list[Sums]:
+        """Recordings that no fit sees."""
+        return self.source.sums[self.training_count :]
 
     def gains(self, groups: Sequence[Group]) -> tuple[float, float]:
         """Return (gain on training, gain on held-out recordings) of base and `groups`.
@@ -153,6 +171,10 @@ class Judge:
             others = training[:k] + training[k + 1 :]
             apart += held_out_gain(solve([*self.base, *groups], others), [training[k]])
         return whole.gain, apart
+
+    def gain(self, groups: Sequence[Group]) -> float:
+        """Return the gain of base and `groups` on all recordings together."""
+        return solve([*self.base, *groups], self.source.sums).gain
 
     def calibrate(self) -> None:
         """Set thresholds: the quantile of the best gains of the whole library on noise."""
@@ -195,133 +217,118 @@ class Judge:
         apart = sum(s.gram[0, 0] - s.count for s in held) - gain[1]
         return max(left, 0.0), max(apart, 0.0)
 
-    def select(self, most: int = 8) -> list[Group]:
-        """Add the best term as long as one stays, then take back what the others have made superfluous."""
+    def select(self, most: int = 6) -> list[Group]:
+        """Add the best hypothesis as long as one stays; then let every one compete again beside the others."""
         chosen: list[Group] = []
-        seen: set[frozenset[tuple[int, ...]]] = set()
+        seen: set[frozenset[object]] = set()
         while len(chosen) < most:
-            left = self.reducible(chosen)
-            ranked = []
-            for group, trained, apart in self.additions(chosen):
-                if self._stays(float(trained[0]), float(apart[0]), left) and not self._allowed([*chosen, group]):
-                    continue
-                ranked.append((float(trained[0]), float(apart[0]), group))
-            passing = [row for row in ranked if self._stays(row[0], row[1], left) and self._agrees(chosen, row[2])]
-            price = self._price()
-            best = max(passing, key=lambda row: row[0] + row[1] - price * row[2].complexity, default=None)
-            top = sorted(ranked, key=lambda row: -(row[0] + row[1]))[:4]
-            self.trace.append(
-                f"left {left[0]:.0f} / {left[1]:.0f}: "
-                + "; ".join(f"{row[2].key} {row[0]:.0f} / {row[1]:.0f}" for row in top)
-            )
-            if best is None:
+            rivals = self.rivals(chosen)
+            passing = [group for group in rivals if self._stays(chosen, group) and self._allowed([*chosen, group])]
+            self._note(chosen, rivals)
+            if not passing:
                 break
-            chosen.append(best[2])
-            chosen = self._without_superfluous(self._swapped(chosen))
-            state = frozenset(group.columns for group in chosen)
+            chosen = [*chosen, self._simplest(chosen, passing)]
+            chosen = self._without_superfluous(self._competed(chosen))
+            state = frozenset(group.key for group in chosen)
             if state in seen:  # what was added is taken back again
                 break
             seen.add(state)
-        return self._simplest(chosen)
+        return chosen
 
-    def _price(self) -> float:
+    def rivals(self, chosen: Sequence[Group], most: int = RIVALS_COUNT) -> list[Group]:
+        """Return the names that gain most beside `chosen`, each at its best shape."""
+        best: dict[object, tuple[float, Group]] = {}
+        price = self.price()
+        for group, trained, apart in self.additions(chosen):
+            worth = float(trained[0]) + max(float(apart[0]), 0.0) - price * group.complexity
+            if group.key not in best or worth > best[group.key][0]:
+                best[group.key] = (worth, group)
+        ranked = sorted(best.values(), key=lambda row: -row[0])
+        possible = (group for _, group in ranked[: 3 * most] if self._allowed([*chosen, group]))
+        return [self.refine([*self.base, *chosen], group) for group in itertools.islice(possible, most)]
+
+    def _note(self, chosen: Sequence[Group], rivals: Sequence[Group]) -> None:
+        now = self.gains(chosen)
+        left = self.reducible(chosen)
+        said = []
+        for group in rivals:
+            gains = self.gains([*chosen, group])
+            said.append(f"{group.key} {gains[0] - now[0]:.0f} / {gains[1] - now[1]:.0f}")
+        self.trace.append(f"left {left[0]:.0f} / {left[1]:.0f}: " + "; ".join(said))
+
+    def price(self) -> float:
         """Return what an amplitude must gain to be worth itself (Schwarz 1978)."""
         return float(np.log(sum(s.count for s in self.training)))
 
     def _worth(self, groups: Sequence[Group]) -> float:
-        """Return gains on both kinds of recordings, less the price of the amplitudes."""
-        trained, apart = self.gains(groups)
-        return trained + apart - self._price() * sum(group.complexity for group in groups)
+        """Return the gain on all recordings, less the price of the amplitudes."""
+        return self.gain(groups) - self.price() * sum(group.complexity for group in groups)
+
+    def _simplest(self, beside: Sequence[Group], candidates: Sequence[Group]) -> Group:
+        """Return the candidate that is worth most; of those that can't be told from it, one with the least numbers."""
+        now = self.gain(beside)
+        gains = {id(group): self.gain([*beside, group]) - now for group in candidates}
+        best = max(candidates, key=lambda group: gains[id(group)] - self.price() * group.complexity)
+        limit = gains[id(best)] - ALIAS_GAIN - ALIAS_SHARE * gains[id(best)]
+        near = [group for group in candidates if gains[id(group)] > limit and group.complexity < best.complexity]
+        return max(near, key=lambda group: gains[id(group)] - self.price() * group.complexity, default=best)
 
     def _allowed(self, groups: Sequence[Group]) -> bool:
-        """Tell whether every amplitude is one that its effect can have, on the training recordings and on all."""
-        everything = [*self.training, *self.held]
-        return all(within_bounds(solve([*self.base, *groups], part)) for part in (self.training, everything))
+        """Tell whether every amplitude is one that its effect can have."""
+        return within_bounds(solve([*self.base, *groups], self.source.sums))
 
-    def _swapped(self, chosen: list[Group]) -> list[Group]:
-        """Exchange terms for ones as simple as long as that is worth more: what came first need not be true."""
-        for _ in range(2 * len(chosen)):
-            now, best, better = self._worth(chosen), chosen, 0.0
-            for k, group in enumerate(chosen):
-                taken = {other.key for other in chosen if other is not group}
-                for other in self.library:
-                    if other is group or other.key in taken or other.complexity > group.complexity:
-                        continue
-                    instead = [*chosen[:k], other, *chosen[k + 1 :]]
-                    gain = self._worth(instead) - now
-                    if gain > max(better, ALIAS_GAIN) and self._allowed(instead):
-                        best, better = instead, gain
-            if best is chosen:
+    def _competed(self, chosen: list[Group]) -> list[Group]:
+        """Let each hypothesis compete again beside the others: what came first need not be true."""
+        for _ in range(2):
+            before = [group.key for group in chosen]
+            for k in range(len(chosen)):
+                rest = [*chosen[:k], *chosen[k + 1 :]]
+                candidates = [chosen[k], *self.rivals(rest, 4)] if len(chosen) > 1 else chosen
+                allowed = [group for group in candidates if self._allowed([*rest, group])] or [chosen[k]]
+                best = self._simplest(rest, allowed)
+                if best.key != chosen[k].key or self._worth([*rest, best]) > self._worth(chosen) + 1e-6:
+                    chosen = [*chosen[:k], best, *chosen[k + 1 :]]
+            if [group.key for group in chosen] == before:
                 break
-            chosen = best
         return chosen
 
-    def _simplest(self, chosen: list[Group]) -> list[Group]:
-        """Take a term with fewer amplitudes wherever it does as well: a superset loses ties."""
-        for k, group in enumerate(chosen):
-            rest = [other for other in chosen if other is not group]
-            now, without = sum(self.gains(chosen)), sum(self.gains(rest))
-            for other in sorted(self.library, key=lambda g: g.complexity):
-                if other.complexity >= group.complexity or other.key in {g.key for g in rest}:
-                    continue
-                instead = [*chosen[:k], other, *chosen[k + 1 :]]
-                loss = now - sum(self.gains(instead))
-                if loss < max(ALIAS_GAIN, _ALIAS_SHARE * (now - without)) and self._allowed(instead):
-                    chosen = instead
-                    break
-        return chosen
-
-    def _agrees(self, chosen: Sequence[Group], group: Group) -> bool:
-        """Tell whether training and held-out recordings ask for the same amplitudes: a law is one law."""
-        if not self.held or group.scope != "structural":
-            return True
-        values = [solve([*self.base, *chosen, group], part).of(group) for part in (self.training, self.held)]
-        (a, a_sd), (b, b_sd) = values
-        allowed = np.maximum(_AGREE_SDS * np.hypot(a_sd, b_sd), _AGREE_RATIO * np.maximum(np.abs(a), np.abs(b)))
-        return bool(np.all(np.abs(a - b) <= allowed))
-
-    def _stays(self, trained: float, apart: float, left: tuple[float, float]) -> bool:
-        """Tell whether gains are beyond noise, and material beside what is left, on whichever side more is left."""
-        before = self.reducible([])
-        shares = [now / first if first > 0.0 else 0.0 for now, first in zip(left, before, strict=True)]
-        share = MATERIAL_RATIO * max(shares)
-        return trained > max(self.thresholds[0], share * before[0]) and apart > max(
-            self.thresholds[1], share * before[1]
+    def _stays(self, chosen: Sequence[Group], group: Group) -> bool:
+        """Tell whether a hypothesis gains beyond noise, on both kinds of recordings, more than it costs, and enough."""
+        now, gains = self.gains(chosen), self.gains([*chosen, group])
+        trained, apart = gains[0] - now[0], gains[1] - now[1]
+        whole = self.gain([*chosen, group])
+        least = MATERIAL_RATIO * (whole - self.gain([]))
+        gained = whole - self.gain(chosen)
+        return (
+            trained > self.thresholds[0]
+            and apart > 0.0
+            and gained > max(sum(self.thresholds), least, self.price() * group.complexity)
         )
 
     def _without_superfluous(self, chosen: list[Group]) -> list[Group]:
-        """Take terms back whose loss is below the thresholds now, the least useful first."""
+        """Take hypotheses back whose loss is too small now, the least useful first."""
         while len(chosen) > 1:
-            now = self.gains(chosen)
             losses = []
             for group in chosen:
                 rest = [other for other in chosen if other is not group]
-                gains = self.gains(rest)
-                losses.append((now[0] - gains[0], now[1] - gains[1], group))
-            weakest = min(losses, key=lambda row: row[0] + row[1])
-            if self._stays(weakest[0], weakest[1], (0.0, 0.0)):
+                losses.append((self.gain(chosen) - self.gain(rest), group, rest))
+            _, weakest, rest = min(losses, key=lambda row: row[0])
+            if self._stays(rest, weakest):
                 return chosen
-            chosen = [other for other in chosen if other is not weakest[2]]
+            chosen = rest
         return chosen
 
     def aliases(self, chosen: Sequence[Group], group: Group) -> list[tuple[object, float]]:
         """Return the keys that would do as well as `group` beside the others, with the margin that they lose by."""
-        everything = [*self.training, *self.held]
         rest = [other for other in chosen if other is not group]
-        with_it = solve([*self.base, *chosen], everything).gain
-        without = solve([*self.base, *rest], everything).gain
-        limit = max(ALIAS_GAIN, _ALIAS_SHARE * (with_it - without))
+        with_it = self.gain(chosen)
+        limit = ALIAS_GAIN + ALIAS_SHARE * (with_it - self.gain(rest))
         margins: dict[object, float] = {}
         taken = {other.key for other in chosen}
-        for other in self.library:
-            if other.key in taken:
+        for other in self.rivals(rest):
+            if other.key in taken or other.complexity > group.complexity or not self._allowed([*rest, other]):
                 continue
-            instead = solve([*self.base, *rest, other], everything)
-            if not within_bounds(instead):
-                continue
-            margin = with_it - instead.gain
-            if other.key not in margins or margin < margins[other.key]:
-                margins[other.key] = margin
+            margins[other.key] = with_it - self.gain([*rest, other])
         return sorted(((key, margin) for key, margin in margins.items() if margin < limit), key=lambda row: row[1])
 
 
@@ -330,7 +337,7 @@ class _Fold:
 
     def __init__(self, groups: Sequence[Group], fitted: Sequence[Sums], judged: Sequence[Sums], on_noise: bool):
         self._fitted, self._judged, self._on_noise = fitted, judged, on_noise
-        self._slots, precision = _slots_of(groups, fitted)
+        self._slots, precision = active_slots(groups, fitted)
         self._rights = {id(s): _right(s, on_noise) for s in [*fitted, *judged]}
         normal = self._cross(self._slots, self._slots, fitted) + np.diag(precision)
         scale = np.sqrt(np.diag(normal))
@@ -342,7 +349,7 @@ class _Fold:
 
     def added(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
         """Return (gain where it is fitted, gain where it is judged) of one group more, one element a right side."""
-        slots, precision = _slots_of([group], self._fitted)
+        slots, precision = active_slots([group], self._fitted)
         cross = self._cross(self._slots, slots, self._fitted)
         back = self._inverse @ cross
         normal = self._cross(slots, slots, self._fitted) + np.diag(precision) - cross.T @ back
@@ -369,7 +376,7 @@ class _Fold:
             if own:
                 rest = right[own] - s.gram[np.ix_(own, columns)] @ theta
                 normal = s.gram[np.ix_(own, own)]
-                normal = normal + _JITTER * np.trace(normal) * np.eye(len(own))
+                normal = normal + (_JITTER * np.trace(normal) + 1e-300) * np.eye(len(own))
                 total += np.einsum("ij,ij->j", rest, np.linalg.solve(normal, rest)) - len(own)
         return total
 
@@ -402,7 +409,20 @@ def _right(s: Sums, on_noise: bool) -> np.ndarray:
     return np.vstack([np.full(s.nulls.shape[0], s.count), s.nulls.T])
 
 
-def _slots_of(groups: Sequence[Group], sums: Sequence[Sums]) -> tuple[list[tuple[int, str]], list[float]]:
+def normal_of(
+    slots: Sequence[tuple[int, str]], precision: Sequence[float], sums: Sequence[Sums]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal matrix, priors included, and the right side of some amplitudes."""
+    normal, right = np.diag(np.array(precision, float)), np.zeros(len(slots))
+    for s in sums:
+        here = [k for k, (_, scope) in enumerate(slots) if _covers(scope, s)]
+        columns = [slots[k][0] for k in here]
+        normal[np.ix_(here, here)] += s.gram[np.ix_(columns, columns)]
+        right[here] += s.gram[columns, 0]
+    return normal, right
+
+
+def active_slots(groups: Sequence[Group], sums: Sequence[Sums]) -> tuple[list[tuple[int, str]], list[float]]:
     """Return (column, scope) of every amplitude of some groups, and how well each is known beforehand."""
     scopes = {
         "structural": ("",),
