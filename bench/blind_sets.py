@@ -47,7 +47,6 @@ class BlindSet:
     believed: Believed
     logs: tuple[Log, ...]
     gains: tuple[dict[str, float], ...]  # of each run's controller
-    starts_s: dict[str, float]  # session time at the start of each run, by the log's name
     relative_reference_m: tuple[np.ndarray | None, ...]
 
 
@@ -61,7 +60,6 @@ def load_set(folder: Path) -> BlindSet:
         _believed(folder.name, modeller),
         tuple(_log(run, table, period_s) for run, table in zip(runs, tables, strict=True)),
         tuple(run["gains"] for run in runs),
-        {Path(run["file"]).stem: run["starts_at_session_s"] for run in runs},
         tuple(table.get("relative_reference_m") for table in tables),
     )
 
@@ -262,7 +260,7 @@ def search(job: Job) -> Searched:
         return Searched(
             job.seed,
             truth,
-            in_words_of_the_truth(findings, blind.starts_s),
+            in_words_of_the_truth(findings),
             len(held),
             (findings.reducible_before[1], findings.reducible_after[1]),
             float(np.sqrt(2.0 * samples_count)),  # of a sum of so many squares of unit variance

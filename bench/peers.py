@@ -260,7 +260,7 @@ class Outcome:
     def mark(self) -> dict[str, Any]:
         """Mark the names by the suite's bars; a peer's verdict is what its names say."""
         found = _findings(self.named, self.verdict)
-        return score.score(in_words_of_the_truth(found, {}), self.case.truth)
+        return score.score(in_words_of_the_truth(found), self.case.truth)
 
 
 def _findings(named: tuple[Named, ...], verdict: str) -> Findings:

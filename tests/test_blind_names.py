@@ -117,8 +117,8 @@ def findings(*effects, errors=(), verdict="found"):
     return Findings("x", ("a",), (), verdict, effects, errors, {}, (), None, nothing, nothing, nothing)
 
 
-def translated(*effects, starts_s=None):
-    return in_words_of_the_truth(findings(*effects), starts_s or {})["effects"]
+def translated(*effects):
+    return in_words_of_the_truth(findings(*effects))["effects"]
 
 
 @pytest.mark.parametrize(("truth", "acts_on", "ours", "beside"), CASES, ids=[case[0] for case in CASES])
@@ -268,29 +268,23 @@ def test_coulomb_friction_of_the_other_axis_stays_beside_a_stribeck_friction():
     }
 
 
-def test_amplitudes_of_sessions_are_pooled_and_drift_is_that_of_the_whole_session():
+def test_amplitudes_of_sessions_are_pooled():
     (found,) = translated(
         named(
             "cogging",
             "macro_force",
-            {"amplitude_n of 0": 1.0, "phase_rad of 0": 0.1, "amplitude_n of 1": 2.0, "pitch_m": 0.02},
-            {"amplitude_n of 0": 0.1, "amplitude_n of 1": 0.2},
+            {
+                "amplitude_n of session 0": 1.0,
+                "phase_rad of session 0": 0.1,
+                "amplitude_n of session 1": 2.0,
+                "pitch_m": 0.02,
+            },
+            {"amplitude_n of session 0": 0.1, "amplitude_n of session 1": 0.2},
         )
     )
     assert found["parameters"]["amplitude_n"] == pytest.approx(1.2)
     low, high = found["interval"]["amplitude_n"]
     assert high - low == pytest.approx(2 * 1.96 / math.sqrt(1 / 0.1**2 + 1 / 0.2**2), rel=1e-3)
-    late = math.exp(-60.0 / 50.0)
-    (drift,) = translated(
-        named(
-            "thermal_drift",
-            "end_sensor",
-            {"drift_m of run_0": 3e-6, "drift_m of run_1": 3e-6 * late, "time_constant_s": 50.0},
-            {"drift_m of run_0": 1e-8, "drift_m of run_1": 1e-8},
-        ),
-        starts_s={"run_0": 0.0, "run_1": 60.0},
-    )
-    assert drift["parameters"]["total_m"] == pytest.approx(3e-6)
 
 
 def test_intervals_follow_the_reading():
@@ -307,10 +301,10 @@ def test_intervals_follow_the_reading():
 def test_aliases_and_parameters_are_said_in_the_truths_words_and_marked():
     effect = named("gravity_tilt", "micro_force", {"grade_ratio": 1e-3}, aliases=[("offset", "macro_force", 1.0)])
     errors = (ParameterError("left_m", 1e-6, 1e-8, 1e-7), ParameterError("right_m", 1e-6, 1e-8, 1e-7))
-    said = in_words_of_the_truth(findings(effect, errors=errors), {})
+    said = in_words_of_the_truth(findings(effect, errors=errors))
     assert said["effects"][0]["alias_set"] == [["offset", "macro_force"]]
     assert [row["name"] for row in said["parameter_errors"]] == ["backlash_width"]
-    strange = in_words_of_the_truth(findings(errors=(ParameterError("macro_latch_s", 1e-5, 1e-8, 1e-7),)), {})
+    strange = in_words_of_the_truth(findings(errors=(ParameterError("macro_latch_s", 1e-5, 1e-8, 1e-7),)))
     assert strange["parameter_errors"] == [{"name": "macro_latch_s", "acts_on": "parameter", "alias_set": []}]
     member = {
         "name": "tilt", "acts_on": "macro_force", "both_axes": True, "outside": False, "amplitude": "angle_rad",
