@@ -11,7 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator
 
-from bench import final_seeds, suite_figures
+from bench import emps_figures, final_seeds, suite_figures
 from bench.blind_names import our_keys
 from bench.blind_sets import Job, Marked, generated, held_out, line, load_set, marked, searched, sets_folder
 from bench.figure import Bar, Figure, absent, judged
@@ -20,7 +20,7 @@ from stagectl.gap.workflow import find
 
 ABOUT = (
     "Sets are those of `tests/blind`. A figure is missed where the 95 % interval excludes its bar; the full run judges "
-    "the value itself. Bars are written in `bench/gap.py` and `bench/suite_figures.py`."
+    "the value itself. Bars are written in `bench/gap.py`, `bench/suite_figures.py` and `bench/emps_figures.py`."
 )
 
 SPEED = Bar("four recordings of 20 s at 1 kHz, full library, 200 nulls: time", "s", 30.0)
@@ -44,6 +44,7 @@ def figures(*, full: bool, say: Say) -> Iterator[Figure]:
     begin_s = time.monotonic()
     say("speed, alone")
     yield speed(full, say)
+    yield from emps_figures.figures(say)
     if full:
         yield from _full(say)
     else:
