@@ -56,6 +56,7 @@ def test_force_laws_are_the_same_rows_with_fewer_columns(friction):
         assert any(same)
 
 
+@pytest.mark.filterwarnings("ignore")  # of the tools' own libraries
 @pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)
 def test_every_tool_finds_two_columns_among_many(tool):
     if importlib.util.find_spec(tool.module) is None:
