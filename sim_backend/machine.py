@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, model_validator
 
 from stagectl import toml_file
+from stagectl.effect_file import EffectFile
 from stagectl.effect_table import EffectTable, without_micro
 from stagectl.errors import ProfileError
 from stagectl.toml_file import Document, Problem, Table, above, missing, problem_if, refuse, whole, within
@@ -172,6 +173,7 @@ class Machine(Document):
     interferometer: Sensor
     air: TrueAir
     start: Start
+    effect_files: tuple[EffectFile, ...] = ()  # before the effects that they declare
     effects: tuple[EffectTable, ...] = ()
 
     @property

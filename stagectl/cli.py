@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+import typer.core
 
 from stagectl import commands
 
@@ -45,8 +46,34 @@ runs_app = typer.Typer(
     epilog=_epilog("stagectl runs list", "stagectl runs plot latest"),
     no_args_is_help=True,
 )
+
+
+class _GapGroup(typer.core.TyperGroup):
+    """Commands of the gap workflow; whatever is no command's name begins the search: `gap PROFILE RUN...`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the name of the search before arguments that begin with none."""
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = [_SEARCH, *args]
+        return super().parse_args(ctx, args)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Show the commands, then the search with its options: it is what `gap` alone does."""
+        super().format_help(ctx, formatter)
+        search = self.commands[_SEARCH]
+        search.format_help(search.make_context(_SEARCH, [], parent=ctx, resilient_parsing=True), formatter)
+
+
+_SEARCH = "search"
+gap_app = typer.Typer(
+    cls=_GapGroup,
+    help="Experimental: find which effect a profile lacks, and add it. `gap PROFILE RUN...` is `gap search` in short.",
+    epilog=_epilog("stagectl gap my-stage.toml run-1 run-2", "stagectl gap apply my-stage.toml gap -o better.toml"),
+    no_args_is_help=True,
+)
 app.add_typer(profile_app, name="profile")
 app.add_typer(runs_app, name="runs")
+app.add_typer(gap_app, name="gap")
 
 
 # ---- what can be asked: each option once --------------------------------------------------------------------------
@@ -110,6 +137,10 @@ GapRuns = Annotated[
 Holdout = Annotated[
     list[str] | None, _option("A run that no fit sees, once for each; without, each is held out once.", metavar="RUN")
 ]
+FindingsArgument = Annotated[Path, typer.Argument(help="findings.json of a search, or its folder.", metavar="FINDINGS")]
+NewProfile = Annotated[Path, _option("Profile to write.", "--out", "-o", metavar="NEW_PROFILE")]
+Candidates = Annotated[bool, _option("Write what is not confirmed yet too, marked so.", "--candidates")]
+Force = Annotated[bool, _option("Replace NEW_PROFILE where it is there already; never PROFILE.", "--force")]
 GapFolder = Annotated[Path, _option("Folder of the findings.", "--out", metavar="FOLDER")]
 
 _PROFILE, _RUNS, _GAP = "oled-printer", Path("runs"), Path("gap")
@@ -296,13 +327,14 @@ def runs_plot(run: RunArgument, out: PlotPlace = None, runs: Runs = _RUNS, json:
     _deliver("runs plot", json, lambda voice: commands.runs.plot(voice, run, runs, out))
 
 
-@app.command(
+@gap_app.command(
+    _SEARCH,
     epilog=_epilog(
         "stagectl gap my-stage.toml 2026-11-20T09-14-03 2026-11-20T09-31-10",
         "stagectl gap profiles/observed/emps.toml lap --holdout pulses --out gap-emps",
-    )
+    ),
 )
-def gap(
+def gap_search(
     profile: ProfileArgument,
     run: GapRuns,
     holdout: Holdout = None,
@@ -313,6 +345,19 @@ def gap(
 ) -> None:
     """Experimental: find which effect the profile lacks. Names are candidates, not yet proved on the hidden suite."""
     _deliver("gap", json, lambda voice: commands.gap.search(voice, profile, run, holdout or [], runs, out, seed))
+
+
+@gap_app.command("apply", epilog=_epilog("stagectl gap apply my-stage.toml gap -o my-stage-2.toml --candidates"))
+def gap_apply(
+    profile: ProfileArgument,
+    findings: FindingsArgument,
+    out: NewProfile,
+    candidates: Candidates = False,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Write a new profile with what was confirmed: values, 95 % intervals, runs, date; the old comments stay."""
+    _deliver("gap apply", json, lambda voice: commands.gap.apply(voice, profile, findings, out, candidates, force))
 
 
 _USAGE_ERROR: Any = typer.BadParameter.__base__

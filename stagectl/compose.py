@@ -10,7 +10,6 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -33,7 +32,7 @@ import numpy as np
 from stagectl.compiled import compiled
 from stagectl.effects import CATALOGUE
 
-law = CATALOGUE[{name!r}].compiled_law
+law = CATALOGUE[{name!r}].compiled_law{origin}
 
 
 @compiled
@@ -147,7 +146,8 @@ def effect_parameters(effects: Iterable[Mapping[str, Any]]) -> np.ndarray:
 def _forces_source(structure: tuple[tuple[str, str], ...]) -> str:
     """Write one function a place that sums the effects acting there."""
     lines = [_FORCES_HEAD]
-    lines += [f"effect_{k} = CATALOGUE[{name!r}].compiled_law" for k, (name, _) in enumerate(structure)]
+    # a law of the user may change under its name: its hash makes another module of it
+    lines += [f"effect_{k} = CATALOGUE[{name!r}].compiled_law{_of(name)}" for k, (name, _) in enumerate(structure)]
     parameter, remembered = 0, 0
     calls: dict[str, list[str]] = {place: [] for place in QUANTITIES_OF}
     at_once: dict[str, list[str]] = {place: [] for place in _COMMANDS}
@@ -176,9 +176,14 @@ def _forces_source(structure: tuple[tuple[str, str], ...]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _of(name: str) -> str:
+    """Return a comment that tells one text of a user's effect from another; empty for those of stagectl."""
+    return f"  # {CATALOGUE[name].origin}" if CATALOGUE[name].origin else ""
+
+
 def generated_module(name_hint: str, source: str) -> ModuleType:
     """Write `source` once under a hash of it in the cache folder, and import it."""
-    name = f"stagectl_generated_{name_hint}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    name = _module_name(name_hint, source)
     if name in sys.modules:
         return sys.modules[name]
     path = CACHE_FOLDER / "generated" / f"{name}.py"
@@ -192,8 +197,21 @@ def generated_module(name_hint: str, source: str) -> ModuleType:
         raise ProfileError(f"can't import the generated module {path}; delete the folder {CACHE_FOLDER}")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
     return module
+
+
+def forget_module(name_hint: str, source: str) -> None:
+    """Import a generated module anew where it is next asked for."""
+    sys.modules.pop(_module_name(name_hint, source), None)
+
+
+def _module_name(name_hint: str, source: str) -> str:
+    return f"stagectl_generated_{name_hint}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
 
 
 def structure_of(effects: Iterable[Mapping[str, Any]]) -> tuple[tuple[str, str], ...]:
@@ -201,7 +219,6 @@ def structure_of(effects: Iterable[Mapping[str, Any]]) -> tuple[tuple[str, str],
     return tuple((row["name"], row["acts_on"]) for row in _check(effects))
 
 
-@cache
 def forces_module(structure: tuple[tuple[str, str], ...]) -> ModuleType:
     """Return the module with one compiled function a place (see `stagectl.effects.PLACES`).
 
@@ -232,7 +249,9 @@ def along(known: Effect) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.nd
     arguments = [f"columns[k, {j}]" for j in range(len(known.quantities))]
     arguments += [f"parameters[{j}]" for j in range(len(known.parameters))]
     arguments += ["memory"] if known.memory else []
-    return generated_module("along", _ALONG.format(name=known.name, arguments=", ".join(arguments))).along
+    return generated_module(
+        "along", _ALONG.format(name=known.name, origin=_of(known.name), arguments=", ".join(arguments))
+    ).along
 
 
 def plant_module(effects: Iterable[Mapping[str, Any]]) -> ModuleType:

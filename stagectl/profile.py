@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationInfo, model_validator
 
 from stagectl import toml_file
+from stagectl.effect_file import EffectFile
 from stagectl.effect_table import EffectTable, without_micro
 from stagectl.errors import ProfileError
 from stagectl.interferometer_profile import Interferometer, carries_end
@@ -318,6 +319,7 @@ class Profile(Document):
     interferometer: Interferometer
     air: Air
     control: Control
+    effect_files: tuple[EffectFile, ...] = ()  # before the effects that they declare
     effects: tuple[EffectTable, ...] = ()
 
     def axis(self, axis: AxisName) -> Axis:

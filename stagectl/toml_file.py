@@ -157,12 +157,18 @@ DocumentT = TypeVar("DocumentT", bound=Document)
 
 def read(model: type[DocumentT], path: Path) -> DocumentT:
     """Read `path` into `model`; raise one ProfileError that lists every problem."""
-    place = _place(path)
     try:
         content = path.read_bytes()
-        data = tomllib.loads(content.decode("utf-8"))
     except OSError as error:
-        raise ProfileError(f"{place}: can't be read ({error.strerror}); check path and permissions") from error
+        raise ProfileError(f"{_place(path)}: can't be read ({error.strerror}); check path and permissions") from error
+    return read_content(model, content, path)
+
+
+def read_content(model: type[DocumentT], content: bytes, path: Path) -> DocumentT:
+    """Read what stands in `path`, or is about to; raise one ProfileError that lists every problem."""
+    place = _place(path)
+    try:
+        data = tomllib.loads(content.decode("utf-8"))
     except UnicodeDecodeError as error:
         raise ProfileError(f"{place}: is not UTF-8 text ({error}); save it as UTF-8") from error
     except RecursionError as error:

@@ -10,6 +10,7 @@ from stagectl.effects import CATALOGUE
 # tanh(1) = (e^2 - 1) / (e^2 + 1); 1 - 1/e
 TANH_1 = 0.76159415595576488812
 GONE = 0.63212055882855767840
+SQUARES = tuple(float(k * k) for k in range(12))
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +137,18 @@ WORKED: dict[str, list[Case]] = {
     "abbe_error": [Case((0.3, 1e-5, 0.1), 4e-7), Case((-0.1, 1e-5, 0.1), 4e-7)],
     # 20 ppm over 100 s are 2 ms, at 0.2 m/s
     "clock_skew": [Case((0.2, 100.0, 20.0), 4e-4), Case((-0.2, 0.0, 20.0), 0.0)],
+    # ---- table ----
+    # squares at 0, 1, ... 11 steps: half-way from 9 to 16 is 12.5; beyond the ends the outer value holds
+    "force_over_position": [
+        Case((0.135, 0.1, 0.01, *SQUARES), 12.5),
+        Case((-9.0, 0.1, 0.01, *SQUARES), 0.0),
+        Case((9.0, 0.1, 0.01, *SQUARES), 121.0),
+    ],
+    "force_over_velocity": [
+        Case((-0.0625, -0.1875, 0.0625, *SQUARES), 4.0),
+        Case((0.5, -0.1875, 0.0625, *SQUARES), 121.0),
+    ],
+    "force_over_relative_position": [Case((1.5e-5, 0.0, 1e-5, *SQUARES), 2.5), Case((-1e-5, 0.0, 1e-5, *SQUARES), 0.0)],
 }
 
 PARAMETERS: dict[str, tuple[float, ...]] = {  # some plausible values, in the order of the declaration
@@ -182,6 +195,9 @@ PARAMETERS: dict[str, tuple[float, ...]] = {  # some plausible values, in the or
     "thermal_drift": (300e-9, 600.0),
     "abbe_error": (1e-5, 0.05),
     "clock_skew": (5.0,),
+    "force_over_position": (-0.022, 0.004, *(0.3 * (-1.0) ** k * k for k in range(12))),
+    "force_over_velocity": (-0.1, 0.02, *(0.3 * (-1.0) ** k * k for k in range(12))),
+    "force_over_relative_position": (-2e-4, 4e-5, *(0.3 * (-1.0) ** k * k for k in range(12))),
 }
 
 

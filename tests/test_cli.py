@@ -54,6 +54,9 @@ COMMANDS = [
     ["runs", "export"],
     ["runs", "import"],
     ["runs", "plot"],
+    ["gap"],
+    ["gap", "search"],
+    ["gap", "apply"],
 ]
 
 
@@ -96,9 +99,25 @@ def test_every_help_has_an_example_and_the_exit_codes(capsys, command):
     assert "Exit codes: 0" in " ".join(out.split())
 
 
-@pytest.mark.parametrize("command", [one for one in COMMANDS if one not in ([], ["profile"], ["runs"])], ids=" ".join)
+@pytest.mark.parametrize(
+    "command", [one for one in COMMANDS if one not in ([], ["profile"], ["runs"], ["gap"])], ids=" ".join
+)
 def test_every_command_speaks_json(capsys, command):
     assert "--json" in call(capsys, *command, "--help")[1]
+
+
+def test_what_is_no_command_of_gap_is_a_search(capsys):
+    for words in (
+        ["gap", "nobody", "run-1"],
+        ["gap", "--seed", "3", "nobody", "run-1"],
+        ["gap", "search", "nobody", "x"],
+    ):
+        code, answer, _ = call_json(capsys, *words)
+        assert (code, answer["command"]) == (2, "gap")
+        assert "profile 'nobody' is not in" in answer["error"]["message"]
+    code, out, _ = call(capsys, "gap", "--help")
+    assert code == 0
+    assert all(word in out for word in ("apply", "--holdout", "PROFILE", "RUN..."))
 
 
 def test_help_loads_nothing_heavy():

@@ -2,19 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from datetime import date
 from pathlib import Path
 
 from rich.markup import escape
 from rich.table import Table
 
+from stagectl import toml_file
 from stagectl.commands.answer import Answer, Voice
+from stagectl.commands.profiles import check_eds
 from stagectl.commands.runs import folder_of
-from stagectl.errors import RequestError
+from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import addition, arbiter
-from stagectl.gap.believed import Believed, load_believed
-from stagectl.gap.findings_file import write_findings
+from stagectl.gap.application import Application, Change, application
+from stagectl.gap.believed import Believed, document_of, load_believed
+from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.log import Log, constant_columns, read_log
 from stagectl.gap.workflow import Findings, Named, find
+from stagectl.profile import Profile, search_folders
+from stagectl.whole_file import replace_whole
 
 FINDINGS = "findings.json"
 
@@ -38,6 +44,67 @@ def search(
     ladder = _ladder(believed, findings, [*logs, *apart], voice)
     data = {"findings": asdict(findings), "file": str(out / FINDINGS), "closed_loop": ladder}
     return Answer(data, [_named(findings), *_ladder_table(ladder), *_sentences(findings, out / FINDINGS)])
+
+
+def apply(voice: Voice, profile: str, findings: Path, out: Path, candidates: bool, force: bool) -> Answer:
+    """Write a new profile: the old one's text with the findings in it; the old one is never touched."""
+    path = toml_file.find(profile, search_folders(), "profile")
+    _refuse_place(path, out, force)
+    try:
+        old = path.read_bytes().decode()
+    except OSError as error:
+        raise ProfileError(f"{path}: can't be read ({error.strerror}); check path and permissions") from error
+    except UnicodeDecodeError as error:
+        raise ProfileError(f"{path}: is not UTF-8 text ({error}); save it as UTF-8") from error
+    document_of(old.encode(), path)  # the old one is right by itself, and its own effects are known from here on
+    file = findings / FINDINGS if findings.is_dir() else findings
+    done = application(old, read_findings(file), candidates=candidates, date=date.today().isoformat())
+    content = done.text.encode()
+    try:
+        document = document_of(content, out)
+        if isinstance(document, Profile):
+            check_eds(document)
+    except ProfileError as error:
+        raise ProfileError(
+            f"the profile with these findings fails its check, {out} is not written:\n{error}"
+        ) from error
+    try:
+        replace_whole(out, content)
+    except OSError as error:
+        raise RequestError(f"-o {out}: can't be written: {error.strerror}; give another file") from error
+    for reason in done.left:
+        voice.warn(f"not written: {reason}")
+    data = {"profile": out, "changes": [asdict(change) for change in done.changes], "left": list(done.left)}
+    return Answer(data, [_changes_table(done), f"Profile: {out}"])
+
+
+def _refuse_place(path: Path, out: Path, force: bool) -> None:
+    """Refuse to write over the old profile at all, and over another file without a word."""
+    if out.exists() and path.exists() and out.samefile(path):
+        raise RequestError(f"-o {out} is the profile itself, which is never changed; give another file")
+    if out.is_dir():
+        raise RequestError(f"-o {out} is a folder; give the file to write")
+    if not out.parent.is_dir():
+        raise RequestError(f"-o {out}: there is no folder {out.parent}; make it, or give another file")
+    if out.exists() and not force:
+        raise RequestError(f"-o {out} is there already; give another file, or --force to replace it")
+
+
+def _changes_table(done: Application) -> Table:
+    table = Table("key", "was", "is", "95 %", "", box=None, header_style="bold")
+    for change in done.changes:
+        table.add_row(
+            escape(change.key),
+            "" if change.before is None else f"{change.before:.6g}",
+            f"{change.value:.6g}",
+            _interval(change),
+            "" if change.confirmed else "candidate",
+        )
+    return table
+
+
+def _interval(change: Change) -> str:
+    return "" if change.half_width is None else f"+- {change.half_width:.2g}"
 
 
 def _log(run: str, runs_root: Path, believed: Believed) -> Log:

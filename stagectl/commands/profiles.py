@@ -17,7 +17,7 @@ from stagectl.units import unit_of
 def check(voice: Voice, profile: str) -> Answer:
     """Load a profile and its EDS files; ProfileError says everything that is wrong with it."""
     found = load_profile(profile)
-    _check_eds(found)
+    check_eds(found)
     remarks = _repeated_effects(found)
     load_ratio = found.worst_bus_load_ratio
     shown = [
@@ -46,7 +46,7 @@ def check(voice: Voice, profile: str) -> Answer:
     return Answer(data, shown)
 
 
-def _check_eds(profile: Profile) -> None:
+def check_eds(profile: Profile) -> None:
     """Refuse EDS files that arming could not use. Errors: ProfileError."""
     problems: list[str] = []
     for name in profile.axes:
@@ -92,7 +92,7 @@ def _grow(tree: Tree, values: dict[str, Any]) -> None:
         else:
             unit = unit_of(key)
             shown = f"{value:.9g}" if isinstance(value, float) else str(value)
-            tree.add(f"{key} = {shown}" + (f" [dim]{unit}[/]" if unit not in (None, "1") else ""))
+            tree.add(f"{key} = {escape(shown)}" + (f" [dim]{unit}[/]" if unit not in (None, "1") else ""))
 
 
 def names(voice: Voice) -> Answer:

@@ -7,9 +7,10 @@ inertia     reaction, wrong mass, a flexible mode, a shaking base
 contact     the joint's contact and the edges of its gap
 drive       from the commanded current to the force
 sensor      from the true position to the reading
+table       forces without a law, as knots over one quantity
 """
 
-from stagectl.effects import contact, drive, friction, inertia, periodic, sensor, stiffness
+from stagectl.effects import contact, drive, friction, inertia, periodic, sensor, stiffness, table
 from stagectl.effects.declaration import (
     CATALOGUE,
     CONTACT_QUANTITIES,
@@ -22,4 +23,4 @@ from stagectl.effects.declaration import (
 )
 
 __all__ = ["CATALOGUE", "CONTACT_QUANTITIES", "PLACES", "QUANTITIES", "QUANTITIES_OF", "TAGS", "Effect", "effect"]
-__all__ += ["contact", "drive", "friction", "inertia", "periodic", "sensor", "stiffness"]
+__all__ += ["contact", "drive", "friction", "inertia", "periodic", "sensor", "stiffness", "table"]

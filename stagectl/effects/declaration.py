@@ -96,6 +96,7 @@ class Effect:
     memory: int  # floats
     linear: tuple[str, ...]  # parameters that the output is linear in, all of them together
     tags: dict[str, str]  # of every parameter, one of TAGS
+    origin: str = ""  # hash of the text that it comes from, where that is a user's own
 
     @property
     def summary(self) -> str:

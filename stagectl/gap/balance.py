@@ -176,35 +176,33 @@ def channels(recording: Recording) -> list[tuple[str, int]]:
     return bodies + [(f"{axis}_current", int(_settled(recording).sum())) for axis in recording.reported_a]
 
 
-def observed(recording: Recording) -> np.ndarray:
+def observed(recording: Recording) -> list[np.ndarray]:
     """Return the innovations of all channels under what is believed."""
     known = known_forces(recording)
     parts = [
         whitened(recording, axis, known.macro_n if axis == "macro" else known.end_n, recording.position_m(axis))
         for axis in recording.axes
     ]
-    parts += [_scaled(recording, axis, reported_a) for axis, reported_a in recording.reported_a.items()]
-    return np.concatenate(parts)
+    return parts + [_scaled(recording, axis, reported_a) for axis, reported_a in recording.reported_a.items()]
 
 
-def column(recording: Recording, forces: Forces) -> np.ndarray:
-    """Return what forces and errors that the filter knows nothing of add to the innovations of all channels."""
-    parts = []
+def column(recording: Recording, forces: Forces) -> list[np.ndarray | None]:
+    """Return what forces and errors that the filter knows nothing of add to the innovations, by channel; None is 0."""
+    parts: list[np.ndarray | None] = []
     for axis, force_n, sensor_m in (
         ("macro", forces.macro_n, forces.macro_sensor_m),
         ("end", forces.end_n, forces.end_sensor_m),
     ):
         if axis in recording.axes:
-            if force_n is None and sensor_m is None:
-                parts.append(np.zeros(int(recording.judged[axis].sum())))
-            else:
+            moved = force_n is not None and bool(np.any(force_n)), sensor_m is not None and bool(np.any(sensor_m))
+            if any(moved):
                 parts.append(whitened(recording, axis, None if force_n is None else -force_n, sensor_m))
+            else:
+                parts.append(None)
     for axis in recording.reported_a:
         current_a = forces.macro_current_a if axis == "macro" else forces.end_current_a
-        parts.append(
-            _scaled(recording, axis, np.zeros(recording.log.samples_count) if current_a is None else current_a)
-        )
-    return np.concatenate(parts)
+        parts.append(None if current_a is None else _scaled(recording, axis, current_a))
+    return parts
 
 
 def _settled(recording: Recording) -> np.ndarray:

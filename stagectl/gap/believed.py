@@ -12,8 +12,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from stagectl import toml_file
+from stagectl.effect_file import EffectFile
 from stagectl.effect_table import EffectTable, without_micro
-from stagectl.profile import Profile, load_profile
+from stagectl.errors import ProfileError
+from stagectl.profile import Profile, search_folders
 from stagectl.toml_file import Document, Table, above, refuse, within
 
 FORCE_CONSTANT_SD_RATIO = 0.01
@@ -81,6 +83,7 @@ class Believed:
     effect_sd_ratio: float = EFFECT_SD_RATIO
     effect_sd_ratios: dict[str, float] = field(default_factory=dict)  # by effect, where it is stated
     travel_m: float = 1.0
+    own_effects: tuple[str, ...] = ()  # of the user's files
     source: dict[str, Any] = field(default_factory=dict)
 
 
@@ -125,6 +128,7 @@ class ObservedMachine(Document):
     sensor: SensorTable
     loop: LoopTable | None = None
     effect_sd_ratio: Annotated[float, above(0.0, 100.0)] = EFFECT_SD_RATIO
+    effect_files: tuple[EffectFile, ...] = ()  # before the effects that they declare
     effects: tuple[EffectTable, ...] = ()
 
     @model_validator(mode="after")
@@ -136,12 +140,24 @@ class ObservedMachine(Document):
 
 def load_believed(name: str | Path) -> Believed:
     """Load a profile, or the file of an observed machine; ProfileError where it is neither."""
-    path = Path(name)
-    if path.suffix == ".toml" and path.exists():
-        table = tomllib.loads(path.read_text())
-        if "can" not in table:
-            return believed_of_observed(toml_file.read(ObservedMachine, path))
-    return believed_of_profile(load_profile(name))
+    path = toml_file.find(name, search_folders(), "profile")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ProfileError(f"{path}: can't be read ({error.strerror}); check path and permissions") from error
+    document = document_of(content, path)
+    if isinstance(document, ObservedMachine):
+        return believed_of_observed(document)
+    return believed_of_profile(document)
+
+
+def document_of(content: bytes, path: Path) -> Profile | ObservedMachine:
+    """Read what stands in `path`, or is about to, as what it is: only a profile has a bus. Errors: ProfileError."""
+    try:
+        driven = "can" in tomllib.loads(content.decode())
+    except (ValueError, RecursionError):
+        driven = True  # whose reader says what is wrong
+    return toml_file.read_content(Profile if driven else ObservedMachine, content, path)
 
 
 def believed_of_observed(machine: ObservedMachine) -> Believed:
@@ -166,6 +182,7 @@ def believed_of_observed(machine: ObservedMachine) -> Believed:
         cascade=cascade,
         effect_sd_ratio=machine.effect_sd_ratio,
         travel_m=body.travel_m,
+        own_effects=tuple(name for file in machine.effect_files for name in file.names),
     )
 
 
@@ -208,4 +225,5 @@ def believed_of_profile(profile: Profile) -> Believed:
         joint=joint,
         effects=tuple(dict(row) for row in profile.effects),
         travel_m=profile.macro.travel_m[1] - profile.macro.travel_m[0],
+        own_effects=tuple(name for file in profile.effect_files for name in file.names),
     )

@@ -36,7 +36,7 @@ def read_findings(path: Path) -> Findings:
         return Findings(**{**content, **{name: tuple(content[name]) for name in lists}})
     except OSError as error:
         raise RecordError(f"{path}: can't read the findings: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise RecordError(f"{path}: not findings of `stagectl gap`: {error}; run it again") from error
 
 

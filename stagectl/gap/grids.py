@@ -3,8 +3,13 @@
 Pure.
 """
 
+import itertools
+
 import numpy as np
 
+from stagectl.effect_text import shape_of
+from stagectl.effects import CATALOGUE, Effect
+from stagectl.effects.table import TABLES
 from stagectl.gap.balance import Recording
 
 _SMOOTHING_M_PER_S = 1e-4
@@ -16,6 +21,7 @@ FREE_SHAPES: dict[str, tuple[str, ...]] = {
     "dahl_friction": ("slip_m",),
     "lugre_friction": ("slip_m", "static_ratio", "stribeck_m_per_s"),
     "cable_hysteresis": ("slip_m",),
+    "cable_spring": ("anchor_m",),
     "soft_contact": ("knee_m",),
     "force_constant_saturation": ("saturation_n",),
     "amplifier_dead_band": ("half_width_a",),
@@ -38,7 +44,7 @@ def grids_for(recordings: list[Recording]) -> Grid:
     """Return, by effect, the shapes to try on these recordings."""
     centre_m = float(np.mean([0.5 * (r.log.macro_position_m.max() + r.log.macro_position_m.min()) for r in recordings]))
     smooth = {"smoothing_m_per_s": _SMOOTHING_M_PER_S}
-    return {
+    library = {
         "coulomb_friction": [smooth],
         "asymmetric_coulomb_friction": [smooth],
         "stribeck_friction": [smooth | {"stribeck_m_per_s": v} for v in (5e-4, 1e-3, 3e-3, 1e-2, 3e-2, 6e-2)],
@@ -70,3 +76,27 @@ def grids_for(recordings: list[Recording]) -> Grid:
         "thermal_drift": [{"time_constant_s": t} for t in (20.0, 60.0, 200.0)],
         "abbe_error": [{"centre_m": 0.0}, {"centre_m": centre_m}],
     }
+    mine = recordings[0].believed.own_effects
+    own = [known for known in CATALOGUE.values() if known.origin]
+    library |= {name: [] for name in TABLES}  # twelve forces fit anything: never a name
+    return library | {known.name: _grid_of(known) if known.name in mine else [] for known in own}
+
+
+_MOST_SHAPES = 60
+_STEPS = (12, 7, 3)  # of one, two, more shape parameters
+_WIDE = 20.0  # ratio of bounds from which steps are ratios
+
+
+def _grid_of(known: Effect) -> list[dict[str, float]]:
+    """Return shapes between the bounds of a user's effect; its files of others in this process have none."""
+    names = shape_of(known)
+    if not names:
+        return [{}]
+    count = _STEPS[min(len(names), len(_STEPS)) - 1]
+    values = []
+    for low, high in (known.bounds[name] for name in names):
+        inside = np.arange(1, count + 1) / (count + 1)
+        is_wide = low > 0.0 and high > _WIDE * low
+        values.append(low * (high / low) ** inside if is_wide else low + (high - low) * inside)
+    shapes = [dict(zip(names, map(float, shape), strict=True)) for shape in itertools.product(*values)]
+    return shapes[:: -(-len(shapes) // _MOST_SHAPES)]

@@ -4,7 +4,7 @@ Each is a group of whitened columns whose amplitudes are solved for; shapes (a p
 Pure.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -216,7 +216,7 @@ def effect_terms(recordings: list[Recording], grids: dict[str, list[dict[str, fl
 
 
 def periodic_terms(
-    recordings: list[Recording], axis: str, pitches_m: list[float], frequencies_hz: list[float]
+    recordings: Sequence[Recording], axis: str, pitches_m: list[float], frequencies_hz: list[float]
 ) -> Iterator[Term]:
     """Yield the effects that have a pitch or a frequency, at those that stand out."""
     force = "macro_force" if axis == "macro" else "micro_force"
@@ -258,10 +258,7 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
     def forces(r: Recording) -> list[Forces]:
         return [_everywhere(r, effect, place, [values[name] for name in effect.parameters]) for values in settings]
 
-    scope = "structural"
-    for tag in ("session", "run"):
-        if tag in effect.tags.values():
-            scope = tag
+    scope = _scope(effect, [name for name in linear] or [effect.parameters[0]])
     bounds = (
         tuple((-high, high) for high in (effect.bounds[name.removesuffix("*")][1] for name in amplitudes))
         if any(name.endswith("*") for name in amplitudes)
@@ -278,8 +275,15 @@ def term_at_size(effect: Effect, place: str, parameters: dict[str, float]) -> Te
         return [_everywhere(r, effect, place, values, whole=True)]
 
     shape = {name: parameters[name] for name in effect.parameters}
-    scope = next((tag for tag in ("session", "run") if tag in effect.tags.values()), "structural")
+    scope = _scope(effect, [effect.parameters[0]])
     return Term(effect.name, place, shape, ("share_of_shape_ratio",), forces, scope, (_SHARE_BOUNDS,), linear=False)
+
+
+def _scope(effect: Effect, amplitudes: list[str]) -> str:
+    """Return how long amplitudes last, with the phases that are solved for as part of them."""
+    tags = {effect.tags[name] for name in amplitudes}
+    tags |= {effect.tags[phase] for phase in (phase_of(effect, name) for name in amplitudes) if phase}
+    return "run" if "run" in tags else "session" if "session" in tags else "structural"
 
 
 _SHARE_BOUNDS = (0.0, 3.0)

@@ -6,56 +6,24 @@ edge that moves by more than the stage touches) are searched in all their parame
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from stagectl.effects import CATALOGUE
-from stagectl.gap import balance, hypotheses
-from stagectl.gap.balance import Recording
+from stagectl.gap import hypotheses
+from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.grids import FREE_SHAPES
 from stagectl.gap.hypotheses import Term
-from stagectl.gap.selection import Group, Sums, active_slots, normal_of
+from stagectl.gap.selection import Group, Sums, active_slots, covers, normal_of
 
 _SWEEPS = 2
 _BRACKET = 2.2  # from the grid's place, up and down
 _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one turn over the travel
+_ANCHOR_M = 1.0
+_STEPS = (-10.0, -3.0, -1.0, -0.3, 0.3, 1.0, 3.0, 10.0)
 _TOLERANCE_RATIO = 3e-3
 _WORST = 1e300
-
-
-@dataclass(slots=True)
-class Evidence:
-    """Whitened innovations and columns of all hypotheses, recording by recording, with their products."""
-
-    recordings: Sequence[Recording]
-    blocks: list[np.ndarray]  # (rows, 1 + columns); row scale is the noise
-    sums: list[Sums]
-    scales: list[np.ndarray]  # by which each row of a new column is divided
-    terms: dict[int, Term]  # by first column
-    made: dict[tuple, Group] = field(default_factory=dict)
-
-    def columns_of(self, term: Term) -> list[np.ndarray]:
-        """Return the columns of a term, one array (rows, amplitudes) a recording."""
-        return [
-            np.column_stack([balance.column(r, forces) for forces in term.forces(r)]) / scale[:, None]
-            for r, scale in zip(self.recordings, self.scales, strict=True)
-        ]
-
-    def append(self, term: Term, columns: list[np.ndarray], prior_sds: tuple[float, ...], searched: int) -> Group:
-        """Add the columns of a term to all products; returns them as a group."""
-        first = self.blocks[0].shape[1]
-        for k, new in enumerate(columns):
-            old, s = self.blocks[k], self.sums[k]
-            cross, own = old.T @ new, new.T @ new
-            gram = np.block([[s.gram, cross], [cross.T, own]])
-            nulls = np.hstack([s.nulls, np.zeros((s.nulls.shape[0], new.shape[1]))])
-            self.sums[k] = replace(s, gram=gram, nulls=nulls)
-            self.blocks[k] = np.hstack([old, new])
-        self.terms[first] = term
-        place = tuple(range(first, first + columns[0].shape[1]))
-        return Group(term.key, place, term.scope, prior_sds, term.bounds, searched)
 
 
 class Refiner:
@@ -71,6 +39,11 @@ class Refiner:
         weights = np.outer(scale, scale)
         self._inverse = np.linalg.inv(normal / weights + 1e-10 * np.eye(scale.size)) / weights
         self._values = self._inverse @ right
+        self._active = []  # by recording: slots that reach it, and by channel which of them are not zero, their rows
+        for s, channels in zip(evidence.sums, evidence.channels, strict=True):
+            here = [k for k, (_, scope) in enumerate(self._slots) if covers(scope, s)]
+            wanted = [self._slots[k][0] for k in here]
+            self._active.append((here, [channel.of(wanted) for channel in channels]))
 
     def refined(self, group: Group) -> Group:
         """Return the group at its best shape, as new columns; the same group where nothing is to be searched."""
@@ -82,36 +55,44 @@ class Refiner:
         if not free and not entire:
             return group
         if entire:
-            term = self._at_size(term, group)
+            term = self._at_size(term)
             free = tuple(dict.fromkeys((*CATALOGUE[term.name].parameters[:1], *free)))
         shape = dict(term.shape)
         best = self._gain(term)
-        for sweep in range(_SWEEPS if len(free) > 1 else 1):
+        for sweep in range(_SWEEPS if len(free) > 1 or entire else 1):
             for name in free:
-                shape, best = self._line(term, shape, name, best, 0.5**sweep)
+                shape, best = self._line(term, shape, name, best, 2.0 if entire and not sweep else 0.5**sweep)
         found = _with_shape(term, shape)
-        key = (found.key, tuple(sorted(shape.items())), self._slots)
         columns = self._evidence.columns_of(found)
         priors = tuple(max(abs(low), abs(high)) for low, high in found.bounds)
         searched = max(group.searched, len(free) - (0 if found.linear else 1))
-        del key
         return self._evidence.append(found, columns, priors, searched)
 
-    def _at_size(self, term: Term, group: Group) -> Term:
-        """Take the amplitude that a first-order solution asks for into the shape."""
+    def gain_at_size(self, group: Group) -> float:
+        """Return what a hypothesis gains at the best of a few sizes, where its column is of no use: in contact."""
+        term = self._evidence.terms[group.columns[0]]
+        touching = any(r.side is not None and bool(np.any(r.side)) for r in self._evidence.recordings)
+        if not touching or not term.acts_on.endswith(("_sensor", "contact_edge")) or not whole_of(term):
+            return 0.0
+        return self._gain(self._at_size(term))
+
+    def _at_size(self, term: Term) -> Term:
+        """Take an amplitude into the shape: what the column asks for, or the best of a few steps up and down."""
         effect = CATALOGUE[term.name]
         amplitude = effect.parameters[0]
-        if term.linear:
-            columns = [block[:, list(group.columns)] for block in self._evidence.blocks]
-            value = float(self._amplitudes(columns, term)[0])
-            shape = {name: term.shape.get(name, 0.0) for name in effect.parameters} | {amplitude: value}
-        else:
-            columns = [block[:, list(group.columns)] for block in self._evidence.blocks]
-            share = float(self._amplitudes(columns, term)[0])
-            low, high = effect.bounds[amplitude]
-            value = float(np.clip(share * term.shape[amplitude], 0.02 * term.shape[amplitude], high))
-            shape = dict(term.shape) | {amplitude: max(value, low)}
-        return hypotheses.term_at_size(effect, term.acts_on, shape)
+        low, high = effect.bounds[amplitude]
+        asked = float(self._amplitudes(self._evidence.columns_of(term), term)[0])
+        value = asked if term.linear else max(asked, 0.02) * term.shape[amplitude]
+        shape = {name: term.shape.get(name, 0.0) for name in effect.parameters}
+        steps = _STEPS if low < 0.0 else _STEPS[len(_STEPS) // 2 :]
+        trials = [
+            hypotheses.term_at_size(effect, term.acts_on, shape | {amplitude: step * value})
+            for step in steps
+            if low <= step * value <= high
+        ]
+        return max(
+            trials, key=self._gain, default=hypotheses.term_at_size(effect, term.acts_on, shape | {amplitude: value})
+        )
 
     def _line(
         self, term: Term, shape: dict[str, float], name: str, best: float, narrow: float
@@ -127,6 +108,8 @@ class Refiner:
         elif name == "frequency_hz" and effect.name == "base_vibration":
             reach = narrow * 0.5 / max(r.log.samples_count * r.log.period_s for r in self._evidence.recordings)
             low, high = max(low, at - reach), min(high, at + reach)
+        elif name == "anchor_m":
+            low, high = max(low, at - _ANCHOR_M), min(high, at + _ANCHOR_M)
         else:
             factor = _BRACKET**narrow
             ends = sorted((at / factor, at * factor))
@@ -159,7 +142,7 @@ class Refiner:
             return float(2.0 * ones @ right - ones @ normal @ ones)
         return float(right @ self._solved(normal, right))
 
-    def _amplitudes(self, columns: list[np.ndarray], term: Term) -> np.ndarray:
+    def _amplitudes(self, columns: Columns, term: Term) -> np.ndarray:
         return self._solved(*self._reduced(columns, term))
 
     @staticmethod
@@ -168,24 +151,26 @@ class Refiner:
         weights = np.outer(scale, scale)
         return np.linalg.solve(normal / weights + 1e-10 * np.eye(scale.size), right / scale) / scale
 
-    def _reduced(self, columns: list[np.ndarray], term: Term) -> tuple[np.ndarray, np.ndarray]:
+    def _reduced(self, columns: Columns, term: Term) -> tuple[np.ndarray, np.ndarray]:
         """Return (normal matrix, right side) of a term's amplitudes with everything beside it eliminated."""
         sums = self._evidence.sums
         places = scopes_of(term.scope, sums)
-        width = columns[0].shape[1]
+        width = len(term.amplitudes)
         size = width * len(places)
         normal, right = np.zeros((size, size)), np.zeros(size)
         cross = np.zeros((len(self._slots), size))
-        for s, block, new in zip(sums, self._evidence.blocks, columns, strict=True):
-            at = next(k for k, scope in enumerate(places) if scope in ("", f"session {s.session}", f"run {s.run}"))
+        for s, channels, (here, active), parts in zip(
+            sums, self._evidence.channels, self._active, columns, strict=True
+        ):
+            at = next(k for k, scope in enumerate(places) if covers(scope, s))
             mine = slice(at * width, (at + 1) * width)
-            here = [
-                k for k, (_, scope) in enumerate(self._slots) if scope in ("", f"session {s.session}", f"run {s.run}")
-            ]
-            active = block[:, [self._slots[k][0] for k in here]]
-            cross[here, mine] += active.T @ new
-            normal[mine, mine] += new.T @ new
-            right[mine] += new.T @ block[:, 0]
+            for channel, (present, rows), part in zip(channels, active, parts, strict=True):
+                if part is None:
+                    continue
+                normal[mine, mine] += part @ part.T
+                right[mine] += part @ channel.rows[0]
+                if rows is not None:
+                    cross[[here[k] for k in present], mine] += rows @ part.T
         return normal - cross.T @ self._inverse @ cross, right - cross.T @ self._values
 
 

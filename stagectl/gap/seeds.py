@@ -4,6 +4,8 @@ The gain of a force on whitened innovations is a scalar product; its adjoint tur
 force, whose spectrum over position or time shows every period at once. Pure.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from stagectl.gap import innovations
@@ -32,7 +34,7 @@ def force_signal(recording: Recording, axis: str, rest: np.ndarray) -> np.ndarra
     return -out[::-1]
 
 
-def pitches_m(recordings: list[Recording], axis: str, signals: list[np.ndarray]) -> list[float]:
+def pitches_m(recordings: Sequence[Recording], axis: str, signals: list[np.ndarray]) -> list[float]:
     """Return the pitches with the highest peaks over position, several recordings together, m."""
     span_m = max(float(np.ptp(r.position_m(axis))) for r in recordings)
     if not span_m > 4.0 * _LEAST_PITCH_M:
@@ -49,7 +51,7 @@ def pitches_m(recordings: list[Recording], axis: str, signals: list[np.ndarray])
     return [1.0 / f for f in _peaks(power, 1.0 / (count * cell_m), 2.0 / span_m, 1.0 / _LEAST_PITCH_M)]
 
 
-def frequencies_hz(recordings: list[Recording], axis: str, signals: list[np.ndarray]) -> list[float]:
+def frequencies_hz(recordings: Sequence[Recording], axis: str, signals: list[np.ndarray]) -> list[float]:
     """Return the frequencies with the highest peaks over time, Hz."""
     period_s = recordings[0].log.period_s
     count = int(2 ** np.ceil(np.log2(2 * max(s.size for s in signals))))

@@ -142,8 +142,10 @@ class Judge:
     base: list[Group]
     library: list[Group]
     refine: Refine
+    gain_at_size: Callable[[Sequence[Group]], Callable[[Group], float]]
     thresholds: tuple[float, float] = (0.0, 0.0)
     trace: list[str] = field(default_factory=list)
+    _known_rivals: dict[frozenset[tuple[int, ...]], list[Group]] = field(default_factory=dict)
 
     @property
     def training(self) -> list[Sums]:
@@ -235,16 +237,28 @@ class Judge:
             seen.add(state)
         return chosen
 
-    def rivals(self, chosen: Sequence[Group], most: int = RIVALS_COUNT) -> list[Group]:
+    def rivals(self, chosen: Sequence[Group]) -> list[Group]:
         """Return the names that gain most beside `chosen`, each at its best shape."""
+        state = frozenset(group.columns for group in chosen)
+        if state not in self._known_rivals:
+            self._known_rivals[state] = self._ranked(chosen, RIVALS_COUNT)
+        return self._known_rivals[state]
+
+    def _ranked(self, chosen: Sequence[Group], most: int) -> list[Group]:
+        """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
+        fold = _Fold([*self.base, *chosen], self.source.sums, self.source.sums, on_noise=False)
         best: dict[object, tuple[float, Group]] = {}
-        price = self.price()
-        for group, trained, apart in self.additions(chosen):
-            worth = float(trained[0]) + max(float(apart[0]), 0.0) - price * group.complexity
+        taken = {group.key for group in chosen}
+        at_size = self.gain_at_size([*self.base, *chosen])
+        for group in self.library:
+            if group.key in taken:
+                continue
+            gain = max(float(fold.added(group)[0][0]), at_size(group))
+            worth = gain - self.price() * group.complexity
             if group.key not in best or worth > best[group.key][0]:
                 best[group.key] = (worth, group)
-        ranked = sorted(best.values(), key=lambda row: -row[0])
-        possible = (group for _, group in ranked[: 3 * most] if self._allowed([*chosen, group]))
+        ranked = [group for _, group in sorted(best.values(), key=lambda row: -row[0])]
+        possible = (group for group in ranked[: 4 * most] if self._allowed([*chosen, group]))
         return [self.refine([*self.base, *chosen], group) for group in itertools.islice(possible, most)]
 
     def _note(self, chosen: Sequence[Group], rivals: Sequence[Group]) -> None:
@@ -283,7 +297,7 @@ class Judge:
             before = [group.key for group in chosen]
             for k in range(len(chosen)):
                 rest = [*chosen[:k], *chosen[k + 1 :]]
-                candidates = [chosen[k], *self.rivals(rest, 4)] if len(chosen) > 1 else chosen
+                candidates = [chosen[k], *self.rivals(rest)]
                 allowed = [group for group in candidates if self._allowed([*rest, group])] or [chosen[k]]
                 best = self._simplest(rest, allowed)
                 if best.key != chosen[k].key or self._worth([*rest, best]) > self._worth(chosen) + 1e-6:
@@ -383,7 +397,7 @@ class _Fold:
     def _seen(self, slots: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
         total = np.zeros((len(slots), self._rights[id(sums[0])].shape[1]))
         for s in sums:
-            here = [k for k, (_, scope) in enumerate(slots) if _covers(scope, s)]
+            here = [k for k, (_, scope) in enumerate(slots) if covers(scope, s)]
             total[here] += self._rights[id(s)][[slots[k][0] for k in here]]
         return total
 
@@ -391,14 +405,15 @@ class _Fold:
     def _cross(a: list[tuple[int, str]], b: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
         total = np.zeros((len(a), len(b)))
         for s in sums:
-            rows = [k for k, (_, scope) in enumerate(a) if _covers(scope, s)]
-            columns = [k for k, (_, scope) in enumerate(b) if _covers(scope, s)]
+            rows = [k for k, (_, scope) in enumerate(a) if covers(scope, s)]
+            columns = [k for k, (_, scope) in enumerate(b) if covers(scope, s)]
             part = s.gram[np.ix_([a[k][0] for k in rows], [b[k][0] for k in columns])]
             total[np.ix_(rows, columns)] += part
         return total
 
 
-def _covers(scope: str, s: Sums) -> bool:
+def covers(scope: str, s: Sums) -> bool:
+    """Tell whether an amplitude of a scope reaches a recording."""
     return scope in ("", f"session {s.session}", f"run {s.run}")
 
 
@@ -415,7 +430,7 @@ def normal_of(
     """Return the normal matrix, priors included, and the right side of some amplitudes."""
     normal, right = np.diag(np.array(precision, float)), np.zeros(len(slots))
     for s in sums:
-        here = [k for k, (_, scope) in enumerate(slots) if _covers(scope, s)]
+        here = [k for k, (_, scope) in enumerate(slots) if covers(scope, s)]
         columns = [slots[k][0] for k in here]
         normal[np.ix_(here, here)] += s.gram[np.ix_(columns, columns)]
         right[here] += s.gram[columns, 0]

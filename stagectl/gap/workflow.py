@@ -14,19 +14,17 @@ from stagectl.errors import RequestError
 from stagectl.gap import balance, hypotheses, seeds
 from stagectl.gap.balance import Recording
 from stagectl.gap.believed import Believed
+from stagectl.gap.evidence import Evidence
 from stagectl.gap.grids import FREE_SHAPES, grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
-from stagectl.gap.refinement import Evidence, Refiner
+from stagectl.gap.refinement import Refiner
 from stagectl.gap.selection import Group, Judge, Solution, Sums, solve
 
-_HIGH_SHARE = 0.3  # of the sample rate: above it forces move nothing
-_LEAST_SCALE = 0.5
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
 _CURVE_SHARE = 0.03
-_REST_PASSES = 3
 _CORNER_RAD_PER_S = 2.0 * np.pi * 1.34
 _FORCE_N = 0.05
 _EXCITED_GAIN = 1e-6
@@ -106,26 +104,26 @@ def find(
     grids = grids_for(recordings)
     terms = [term for term in hypotheses.effect_terms(recordings, grids) if term.name not in without]
     say("looking for what repeats in position and time")
-    fixed = [term for term, _ in base] + wrong + terms + curves
-    blocks = [_columns(recording, fixed) for recording in recordings]
-    periodic = [term for term in _periodic_terms(recordings, blocks, base, [*wrong, *terms], curves)]
-    periodic = [term for term in periodic if term.name not in without]
-    blocks = [
-        np.column_stack([block, *(balance.column(r, f) for term in periodic for f in term.forces(r))])
-        for block, r in zip(blocks, recordings, strict=True)
-    ]
-    say(f"{len(terms)} hypotheses of {len({term.key for term in terms})} effects on {len(logs)} recordings")
-    members = [("base", term, (sd,)) for term, sd in base]
-    members += [("library", term, _widest(term)) for term in [*wrong, *terms]]
-    members += [("curves", term, _widest(term)) for term in curves]
-    members += [("library", term, _widest(term)) for term in periodic]
-    groups, evidence = _evidence(recordings, blocks, members, nulls_count, seed)
+    evidence = Evidence(recordings)
+    groups = _Groups()
+    for term, sd in base:
+        groups.add("base", evidence.add(term), term, (sd,))
+    for term in [*wrong, *terms]:
+        groups.add("library", evidence.add(term), term)
+    for term in curves:
+        groups.add("curves", evidence.add(term), term)
+    for term in _periodic_terms(evidence, groups.prior_sds()):
+        if term.name not in without:
+            groups.add("library", evidence.add(term), term)
+    evidence.finish(np.array([sd for _, sd in base]), nulls_count, seed)
+    say(f"{len(groups.library)} hypotheses of {len({g.key for g in groups.library})} names on {len(logs)} recordings")
     judge = Judge(
         evidence,
         len(training),
-        groups["base"],
-        groups["library"],
+        groups.base,
+        groups.library,
         lambda beside, group: Refiner(evidence, beside).refined(group),
+        lambda beside: Refiner(evidence, beside).gain_at_size,
     )
     say("what the library gains on noise")
     judge.calibrate()
@@ -134,7 +132,7 @@ def find(
     chosen = judge.select()
     after = judge.reducible(chosen)
     solution = solve([*judge.base, *chosen], evidence.sums)
-    unknown = _unknown(judge, chosen, groups["curves"], evidence)
+    unknown = _unknown(judge, chosen, groups.curves, evidence)
     effects = [group for group in chosen if evidence.terms[group.columns[0]].acts_on != "parameter"]
     named = tuple(_named(judge, chosen, group, solution, evidence) for group in effects)
     verdict = "unknown" if unknown is not None else "found" if named else "nothing"
@@ -175,73 +173,39 @@ def _first_noise(believed: Believed, recording: Recording) -> dict[str, Noise]:
     return noise
 
 
-def _evidence(
-    recordings: Sequence[Recording],
-    blocks: list[np.ndarray],
-    members: list[tuple[str, Term, tuple[float, ...]]],
-    nulls_count: int,
-    seed: int,
-) -> tuple[dict[str, list[Group]], Evidence]:
-    """Say which columns belong to which hypothesis, scale every recording by its noise, and sum."""
-    groups: dict[str, list[Group]] = {"base": [], "library": [], "curves": []}
-    terms: dict[int, Term] = {}
-    searched = _searched([term for kind, term, _ in members if kind == "library"])
-    place = 1
-    for kind, term, sds in members:
-        columns = tuple(range(place, place + len(term.amplitudes)))
-        place += len(columns)
-        more = searched.get(term.key, 0) if kind == "library" else 0
-        groups[kind].append(Group(term.key, columns, term.scope, sds, term.bounds, more))
-        terms[columns[0]] = term
-    prior_sds = np.concatenate([np.asarray(sds) for _, _, sds in members])
-    known = sum(len(sds) for kind, _, sds in members if kind == "base")
-    sums, scales, scaled = [], [], []
-    for number, (recording, block) in enumerate(zip(recordings, blocks, strict=True)):
-        scale = _noise_scale(recording, block[:, : 1 + known], prior_sds[:known])
-        block = block / scale[:, None]
-        random = np.random.default_rng([seed, number])
-        nulls = random.standard_normal((nulls_count, block.shape[0])) @ block[:, 1:]
-        sums.append(Sums(block.T @ block, float(block.shape[0]), recording.log.session, recording.log.name, nulls))
-        scales.append(scale)
-        scaled.append(block)
-    return groups, Evidence(recordings, scaled, sums, scales, terms)
+class _Groups:
+    """Which columns belong to which hypothesis."""
+
+    def __init__(self) -> None:
+        self.base: list[Group] = []
+        self.library: list[Group] = []
+        self.curves: list[Group] = []
+        self._sds: list[float] = []
+
+    def add(self, kind: str, columns: tuple[int, ...], term: Term, sds: tuple[float, ...] | None = None) -> None:
+        """Take a hypothesis in; without `sds` its amplitudes may be as large as its effect can be."""
+        sds = _widest(term) if sds is None else sds
+        searched = 0
+        if kind == "library":
+            searched = max(len(FREE_SHAPES.get(term.name, ())) - (0 if term.linear else 1), 0)
+        getattr(self, kind).append(Group(term.key, columns, term.scope, sds, term.bounds, searched))
+        self._sds += sds
+
+    def prior_sds(self) -> np.ndarray:
+        """Return how large each amplitude may be, by column."""
+        return np.array(self._sds)
 
 
-def _searched(terms: list[Term]) -> dict[object, int]:
-    """Count, by name, the shape parameters that are searched: but one where they are all that an effect has."""
-    return {term.key: max(len(FREE_SHAPES.get(term.name, ())) - (0 if term.linear else 1), 0) for term in terms}
-
-
-def _periodic_terms(
-    recordings: list[Recording],
-    blocks: list[np.ndarray],
-    base: list[tuple[Term, float]],
-    terms: list[Term],
-    curves: list[Term],
-) -> list[Term]:
+def _periodic_terms(evidence: Evidence, prior_sds: np.ndarray) -> list[Term]:
     """Make terms of pitches and frequencies that stand out of what all other hypotheses leave."""
-    signals: dict[str, list[np.ndarray]] = {axis: [] for axis in recordings[0].axes}
-    for recording, z in zip(recordings, blocks, strict=True):
-        sds = np.concatenate([[sd for _, sd in base], *(_widest(term) for term in terms + curves)])
-        start = 0
-        for axis in recording.axes:
-            size = int(recording.judged[axis].sum())
-            signals[axis].append(seeds.force_signal(recording, axis, _rest(z[start : start + size], sds)))
-            start += size
-    found = []
-    for axis, of_axis in signals.items():
-        pitches = seeds.pitches_m(recordings, axis, of_axis)
-        frequencies = seeds.frequencies_hz(recordings, axis, of_axis)
+    recordings = evidence.recordings
+    found: list[Term] = []
+    for place, axis in enumerate(recordings[0].axes):
+        signals = [seeds.force_signal(r, axis, evidence.rest(k, place, prior_sds)) for k, r in enumerate(recordings)]
+        pitches = seeds.pitches_m(recordings, axis, signals)
+        frequencies = seeds.frequencies_hz(recordings, axis, signals)
         found += hypotheses.periodic_terms(recordings, axis, pitches, frequencies)
     return found
-
-
-def _columns(recording: Recording, terms: Sequence[Term]) -> np.ndarray:
-    """Return the whitened innovations and the columns of all terms, shape (m, 1 + columns)."""
-    columns = [balance.observed(recording)]
-    for term in terms:
-        columns += [balance.column(recording, forces) for forces in term.forces(recording)]
-    return np.column_stack(columns)
 
 
 def _widest(term: Term) -> tuple[float, ...]:
@@ -249,45 +213,6 @@ def _widest(term: Term) -> tuple[float, ...]:
     if not term.bounds:
         return (np.inf,) * len(term.amplitudes)
     return tuple(max(abs(low), abs(high)) for low, high in term.bounds)
-
-
-def _noise_scale(recording: Recording, z: np.ndarray, prior_sds: np.ndarray) -> np.ndarray:
-    """Return, by row, the noise in units of what was believed of it: as large as it is at the highest frequencies.
-
-    z: innovations and the columns of known parameters. At high frequencies no effect reaches far; taken from all that
-    is left it would hide whatever nobody explains, and beside all columns of the library, some of which hold measured
-    accelerations, it came out a tenth too small.
-    """
-    scale = np.ones(z.shape[0])
-    start = 0
-    for _, size in balance.channels(recording):
-        rest = _rest(z[start : start + size], prior_sds)
-        power = np.abs(np.fft.rfft(rest)) ** 2 / size
-        high = np.fft.rfftfreq(size) > _HIGH_SHARE
-        scale[start : start + size] = max(float(np.sqrt(np.mean(power[high]))), _LEAST_SCALE)
-        start += size
-    return scale
-
-
-def _rest(block: np.ndarray, prior_sds: np.ndarray) -> np.ndarray:
-    """Return the innovations without everything that any hypothesis explains: what is left is noise, if anything is.
-
-    Amplitudes keep to their priors: free, a scale error of the sensor and one of the forces explain any motion whole.
-    """
-    columns = block[:, 1:]
-    scale = np.sqrt(np.einsum("ij,ij->j", columns, columns))
-    used = scale > 0.0
-    columns, scale = columns[:, used] / scale[used], scale[used]
-    normal = columns.T @ columns
-    right = columns.T @ block[:, 0]
-    variance = 1.0
-    rest = block[:, 0]
-    for _ in range(_REST_PASSES):
-        precision = variance / (scale * prior_sds[used]) ** 2 + 1e-9
-        theta = np.linalg.solve(normal + np.diag(precision), right)
-        rest = block[:, 0] - columns @ theta
-        variance = float(np.mean(rest * rest))
-    return rest
 
 
 def _energy(group: Group, s: Sums) -> float:
@@ -324,8 +249,12 @@ def _readable(
     errors: dict[str, float] = {}
     per = len(term.amplitudes)
     if not term.linear:
-        (first, value), *rest = term.shape.items()
-        return {first: float(values[0]) * value, **dict(rest)}, {first: float(sds[0]) * abs(value)}
+        (first, at), *rest = term.shape.items()
+        for place, value, sd in zip(places, values, sds, strict=True):
+            mark = f" of {place}" if place else ""
+            parameters[first + mark] = float(value) * at
+            errors[first + mark] = float(sd) * abs(at)
+        return parameters | dict(rest), errors
     for number, place in enumerate(places):
         mark = f" of {place}" if place else ""
         here, sd = values[number * per : (number + 1) * per], sds[number * per : (number + 1) * per]
