@@ -42,8 +42,8 @@ SETS_COUNT = 4
 _BLOCKS_COUNT = 6
 _ALPHA = 0.01
 _MOST_TERMS = 20
-_STLSQ_THRESHOLDS = np.geomspace(0.01, 3.0, 12)
-_L1_WEIGHTS = np.geomspace(1e-4, 0.3, 8)
+_STLSQ_THRESHOLDS = np.geomspace(0.01, 3.0, 8)
+_L1_WEIGHTS = np.geomspace(1e-4, 0.3, 6)
 _ZERO = 1e-4
 
 Fit = Callable[[np.ndarray, np.ndarray], np.ndarray]
