@@ -72,7 +72,8 @@ def _asymmetry(forward: str, backward: str) -> Reading:
 
 
 def _angle(ours: Mapping[str, float]) -> float:
-    return -math.asin(ours.get("grade_ratio", math.nan))
+    grade = ours.get("grade_ratio", math.nan)
+    return -math.asin(grade) if abs(grade) <= 1.0 else math.nan
 
 
 def _loss_at_100_n(ours: Mapping[str, float]) -> float:

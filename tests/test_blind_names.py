@@ -287,6 +287,17 @@ def test_amplitudes_of_sessions_are_pooled():
     assert high - low == pytest.approx(2 * 1.96 / math.sqrt(1 / 0.1**2 + 1 / 0.2**2), rel=1e-3)
 
 
+@pytest.mark.parametrize("value", [0.0, -1e9, 1e9, float("inf"), float("nan")])
+def test_no_value_is_too_odd_to_be_translated(value):
+    """A tool without bounds fits a tilt of sine 5: it is named, and has no angle."""
+    for one in TRANSLATIONS:
+        effect = CATALOGUE[one.ours]
+        parameters = dict.fromkeys(effect.parameters, value)
+        (found,) = translated(named(one.ours, one.places[0][1], parameters, dict.fromkeys(parameters, 1.0)))
+        assert found["name"] == one.truth
+        assert all(math.isfinite(number) for number in found["parameters"].values())
+
+
 def test_intervals_follow_the_reading():
     (found,) = translated(
         named("tilt", "macro_force", {}),
