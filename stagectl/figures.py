@@ -3,63 +3,24 @@
 Takes plain arrays; knows no run folder.
 """
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure as Drawing
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
-from stagectl.errors import RequestError
+from stagectl.drawing import STYLE, by_decade, colours_of, envelope, image_of, legend, panels_of, plain_log
 from stagectl.metrics import cumulative_rms, timing_statistics
-from stagectl.report import GRID, INK, MUTED, SERIES, Quantity, rounded
+from stagectl.report import INK, MUTED, SERIES, Quantity, rounded
 
 _POINT = "#7f8894"
 """Grey of measured points; they are drawn as pixels, so it has to do on light and on dark."""
 
-_STYLE: Any = {
-    "font.family": "sans-serif",
-    "font.size": 9.5,
-    "text.color": INK,
-    "text.parse_math": False,  # a dollar sign in a name is a dollar sign
-    "axes.edgecolor": MUTED,
-    "axes.labelcolor": INK,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "grid.color": GRID,
-    "grid.linewidth": 0.6,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "xtick.major.size": 3.0,
-    "ytick.major.size": 3.0,
-    "legend.frameon": False,
-    "legend.fontsize": 9.0,
-    "legend.handlelength": 1.4,
-    "lines.linewidth": 1.1,
-    "lines.solid_joinstyle": "round",
-    "svg.fonttype": "none",  # words stay words: searchable, and in the page's own font
-    "svg.hashsalt": "stagectl",
-    "axes.unicode_minus": True,
-}
 
-_WIDTH_IN = 6.2
-_PIXELS_PER_INCH = 200
-_LINE_BINS_COUNT = 800
 _CURVE_POINTS_COUNT = 500
 _POINTS_MAX_COUNT = 8000
 
@@ -123,12 +84,12 @@ def tracking_figure(
 
     Where one law is far better than another a third panel shows the same again, enlarged to the better one.
     """
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         peaks_m = [float(np.max(np.abs(trace.true_m))) for trace in traces]
         enlarged = max(peaks_m) > 3.0 * min(peaks_m)
         ratios = (1.2, 2.0, 1.6) if enlarged else (1.2, 2.2)
-        drawing, panels = _panels(1.9 + 0.75 * sum(ratios), len(ratios), 1, sharex=True, height_ratios=ratios)
-        panels[0].plot(*_envelope(t_s, np.asarray(reference_m) * 1e3), color=INK)
+        drawing, panels = panels_of(1.9 + 0.75 * sum(ratios), len(ratios), 1, sharex=True, height_ratios=ratios)
+        panels[0].plot(*envelope(t_s, np.asarray(reference_m) * 1e3), color=INK)
         panels[0].set_ylabel("reference (mm)")
         name = "true error" if all(trace.measured_m is not None for trace in traces) else "error"
         for axes, largest_m in zip(panels[1:], (max(peaks_m), min(peaks_m)), strict=False):
@@ -143,20 +104,20 @@ def tracking_figure(
         panels[-1].set_xlabel("time (s)")
         panels[-1].set_xlim(float(t_s[0]), float(t_s[-1]))
         drawing.align_ylabels()
-        _legend(drawing, panels[1], columns=2)
-        return _image(drawing, image_format)
+        legend(drawing, panels[1], columns=2)
+        return image_of(drawing, image_format)
 
 
 def _errors(axes: Axes, traces: Sequence[ErrorTrace], scale: float) -> None:
     """Draw all measured errors, then all true ones on top."""
-    for trace, colour in zip(traces, _colours(traces), strict=True):
+    for trace, colour in zip(traces, colours_of(traces), strict=True):
         if trace.measured_m is not None:
-            t, error = _envelope(trace.t_s, np.asarray(trace.measured_m) * scale)
+            t, error = envelope(trace.t_s, np.asarray(trace.measured_m) * scale)
             axes.plot(t, error, color=colour, linewidth=0.6, alpha=0.30)
-    for trace, colour in zip(traces, _colours(traces), strict=True):
+    for trace, colour in zip(traces, colours_of(traces), strict=True):
         true_m = np.asarray(trace.true_m)
         peak, rms = Quantity(float(np.max(np.abs(true_m))), "m"), Quantity(float(np.sqrt(np.mean(true_m**2))), "m")
-        t, error = _envelope(trace.t_s, true_m * scale)
+        t, error = envelope(trace.t_s, true_m * scale)
         axes.plot(t, error, color=colour, label=f"{trace.label}: peak {peak}, rms {rms}")
     if any(trace.measured_m is not None for trace in traces):
         axes.plot([], [], color=MUTED, linewidth=4.0, alpha=0.35, label="pale: as the interferometer measured it")
@@ -164,18 +125,18 @@ def _errors(axes: Axes, traces: Sequence[ErrorTrace], scale: float) -> None:
 
 def hold_figure(holds: Sequence[HoldTrace], image_format: str = "svg") -> bytes:
     """Error while holding: how it is distributed, and from which frequencies its rms comes."""
-    with matplotlib.rc_context(_STYLE):
-        drawing, (left, right) = _panels(2.75, 1, 2)
+    with matplotlib.rc_context(STYLE):
+        drawing, (left, right) = panels_of(2.75, 1, 2)
         span = 1e9 * max(float(np.max(np.abs(hold.error_m))) for hold in holds) or 1.0  # an ideal rig holds at 0
         bins = np.linspace(-span, span, 62)
-        for hold, colour in zip(holds, _colours(holds), strict=True):
+        for hold, colour in zip(holds, colours_of(holds), strict=True):
             error = np.asarray(hold.error_m) * 1e9
             share = 100.0 * np.histogram(error, bins)[0] / error.size
             left.stairs(share, bins, color=colour, alpha=0.18, fill=True)
             rms = Quantity(float(np.sqrt(np.mean(np.asarray(hold.error_m) ** 2))), "m")
             left.stairs(share, bins, color=colour, linewidth=1.1, label=f"{hold.label}: {rms} rms")
             spectrum = cumulative_rms(hold.error_m, hold.dt_s)
-            frequency_hz, cumulative = _by_decade(spectrum.frequency_hz, spectrum.cumulative_rms_m * 1e9)
+            frequency_hz, cumulative = by_decade(spectrum.frequency_hz, spectrum.cumulative_rms_m * 1e9)
             right.plot(frequency_hz, cumulative, color=colour, drawstyle="steps-post")
         kind = "true" if all(hold.is_true for hold in holds) else "measured"
         left.set_xlabel(f"{kind} error of the end (nm)")
@@ -186,9 +147,9 @@ def hold_figure(holds: Sequence[HoldTrace], image_format: str = "svg") -> bytes:
         right.set_ylabel("cumulative rms (nm)")
         right.set_ylim(bottom=0.0)
         right.margins(x=0.0)
-        _plain_log(right.xaxis)
-        _legend(drawing, left, columns=2)
-        return _image(drawing, image_format)
+        plain_log(right.xaxis)
+        legend(drawing, left, columns=2)
+        return image_of(drawing, image_format)
 
 
 def backlash_figure(
@@ -199,8 +160,8 @@ def backlash_figure(
     image_format: str = "svg",
 ) -> bytes:
     """Contact force over macro minus end: the points that were measured, and the identified law through them."""
-    with matplotlib.rc_context(_STYLE):
-        drawing, (axes,) = _panels(3.5, 1, 1)
+    with matplotlib.rc_context(STYLE):
+        drawing, (axes,) = panels_of(3.5, 1, 1)
         offset, force_n = np.asarray(macro_minus_end_m) * 1e6, np.asarray(contact_force_n)
         stride = max(1, math.ceil(offset.size / _POINTS_MAX_COUNT))
         axes.plot(
@@ -235,15 +196,15 @@ def backlash_figure(
         _slope(axes, 0.98, "right stiffness", identified.right_stiffness_n_per_m, true_right_k)
         axes.set_xlabel("macro minus end (µm)")
         axes.set_ylabel("contact force (N)")
-        _legend(drawing, axes, columns=2)
-        return _image(drawing, image_format)
+        legend(drawing, axes, columns=2)
+        return image_of(drawing, image_format)
 
 
 def convergence_figure(estimates: Sequence[Estimate], image_format: str = "svg") -> bytes:
     """Each parameter as it is identified, with its 95 % band; the true value dashed where it is known."""
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         rows = math.ceil(len(estimates) / 2)
-        drawing, panels = _panels(0.6 + 1.75 * rows, rows, 2, sharex=True)
+        drawing, panels = panels_of(0.6 + 1.75 * rows, rows, 2, sharex=True)
         for axes, estimate in zip(panels, estimates, strict=False):
             t, value, half = (np.asarray(a, dtype=float) for a in (estimate.t_s, estimate.value, estimate.half_width))
             shown = np.linspace(0, t.size - 1, min(t.size, _CURVE_POINTS_COUNT)).astype(int)
@@ -270,13 +231,13 @@ def convergence_figure(estimates: Sequence[Estimate], image_format: str = "svg")
             names.append(("true (rig)", {"color": SERIES[0], "linestyle": (0, (4, 2))}))
         handles = [Line2D([], [], label=name, **look) for name, look in names]
         drawing.legend(handles=handles, loc="outside upper left", ncols=3, borderaxespad=0.2)
-        return _image(drawing, image_format)
+        return image_of(drawing, image_format)
 
 
 def timing_figure(series: Sequence[TimeSeries], deadline_ns: int | None = None, image_format: str = "svg") -> bytes:
     """How long things took, both axes logarithmic, so that one late cycle in a million is seen."""
-    with matplotlib.rc_context(_STYLE):
-        drawing, (axes,) = _panels(2.9 + 0.17 * len(series), 1, 1)
+    with matplotlib.rc_context(STYLE):
+        drawing, (axes,) = panels_of(2.9 + 0.17 * len(series), 1, 1)
         floor_us = 0.1  # below it no clock of ours tells times apart; earlier and zero count there
         columns_us = [np.maximum(np.asarray(one.time_ns) * 1e-3, floor_us) for one in series]
         low_us = min(float(column.min()) for column in columns_us)
@@ -284,7 +245,7 @@ def timing_figure(series: Sequence[TimeSeries], deadline_ns: int | None = None, 
         if deadline_ns is not None:
             high_us = max(high_us, deadline_ns * 1e-3)
         bins_us = np.geomspace(low_us / 1.2, high_us * 1.2, 90)
-        for one, column_us, colour in zip(series, columns_us, _colours(series), strict=True):
+        for one, column_us, colour in zip(series, columns_us, colours_of(series), strict=True):
             count = np.histogram(column_us, bins_us)[0]
             times = timing_statistics(one.time_ns, deadline_ns)
             figures = ", ".join(
@@ -301,8 +262,8 @@ def timing_figure(series: Sequence[TimeSeries], deadline_ns: int | None = None, 
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_ylim(0.5, axes.get_ylim()[1] * (5.0 if deadline_ns is not None else 1.5))
-        _plain_log(axes.xaxis)
-        _plain_log(axes.yaxis)
+        plain_log(axes.xaxis)
+        plain_log(axes.yaxis)
         if deadline_ns is not None:
             axes.axvline(deadline_ns * 1e-3, color=INK, linewidth=0.9, linestyle=(0, (4, 2)))
             axes.annotate(
@@ -317,57 +278,8 @@ def timing_figure(series: Sequence[TimeSeries], deadline_ns: int | None = None, 
             )
         axes.set_xlabel("time (µs)")
         axes.set_ylabel("cycles per bin")
-        _legend(drawing, axes, columns=1)
-        return _image(drawing, image_format)
-
-
-def _panels(
-    height_in: float, rows: int, columns: int, sharex: bool = False, height_ratios: Sequence[float] | None = None
-) -> tuple[Drawing, list[Axes]]:
-    """An empty drawing and its axes, row by row."""
-    drawing = Drawing(figsize=(_WIDTH_IN, height_in), layout="constrained")
-    grid = drawing.subplots(rows, columns, sharex=sharex, squeeze=False, gridspec_kw={"height_ratios": height_ratios})
-    return drawing, list(grid.flat)
-
-
-def _image(drawing: Drawing, image_format: str) -> bytes:
-    """Render as SVG without background, or as PNG on white."""
-    if image_format not in ("svg", "png"):
-        raise RequestError(f"image_format is {image_format!r}; 'svg' or 'png' is needed")
-    stream = io.BytesIO()
-    if image_format == "png":
-        FigureCanvasAgg(drawing).print_figure(stream, format="png", dpi=_PIXELS_PER_INCH, facecolor="white")
-    else:
-        drawing.savefig(stream, format="svg", dpi=_PIXELS_PER_INCH, transparent=True, metadata={"Date": None})
-    return stream.getvalue()
-
-
-def _colours(things: Sequence[object]) -> list[str]:
-    """One colour for each; a single one gets ours."""
-    return [SERIES[1]] if len(things) == 1 else [SERIES[i % len(SERIES)] for i in range(len(things))]
-
-
-def _envelope(t_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thin a long line to the smallest and largest value of each pixel: no peak is lost."""
-    t_s, values = np.asarray(t_s), np.asarray(values)
-    width = t_s.size // _LINE_BINS_COUNT
-    if width < 3:
-        return t_s, values
-    count = t_s.size // width * width
-    blocks = values[:count].reshape(-1, width)
-    first = np.arange(len(blocks)) * width
-    extremes = np.sort(np.stack([first + blocks.argmin(axis=1), first + blocks.argmax(axis=1)], axis=1), axis=1).ravel()
-    kept = np.unique(np.concatenate([[0], extremes, np.arange(count, t_s.size), [t_s.size - 1]]))
-    return t_s[kept], values[kept]
-
-
-def _by_decade(frequency_hz: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thin a long spectrum evenly in the logarithm of the frequency; it rises, so nothing between is lost."""
-    if frequency_hz.size <= _LINE_BINS_COUNT:
-        return frequency_hz, values
-    wanted = np.geomspace(frequency_hz[0], frequency_hz[-1], _LINE_BINS_COUNT)
-    kept = np.unique(np.minimum(np.searchsorted(frequency_hz, wanted), frequency_hz.size - 1))
-    return frequency_hz[kept], values[kept]
+        legend(drawing, axes, columns=1)
+        return image_of(drawing, image_format)
 
 
 def _settled_range(value: np.ndarray, half: np.ndarray, true_value: float | None) -> tuple[float, float]:
@@ -422,29 +334,6 @@ def _slope(axes: Axes, across: float, name: str, stiffness_n_per_m: float, true_
         fontsize=9.0,
         linespacing=1.35,
     )
-
-
-def _legend(drawing: Drawing, axes: Axes, columns: int) -> None:
-    """Put the legend of `axes` on top of the whole drawing, in the order drawn, row by row."""
-    handles, labels = axes.get_legend_handles_labels()
-    # Matplotlib fills column by column.
-    order = [i for column in range(columns) for i in range(column, len(labels), columns)]
-    drawing.legend(
-        [handles[i] for i in order],
-        [labels[i] for i in order],
-        loc="outside upper left",
-        ncols=min(columns, len(labels)),
-        borderaxespad=0.2,
-        borderpad=0.1,
-        columnspacing=1.6,
-    )
-
-
-def _plain_log(axis: Axis) -> None:
-    """Decades as plain numbers."""
-    axis.set_major_locator(LogLocator(10.0, numticks=12))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.12g}".replace(",", "\u2009")))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _with_band(value: float, half_width: float) -> str:

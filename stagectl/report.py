@@ -71,22 +71,32 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One picture (SVG or PNG bytes) with what it shows, in words."""
+    """One picture (SVG or PNG bytes) with what it shows, in words; `alternative` is read aloud in its place."""
 
     title: str
     image: bytes
     caption: str = ""
+    alternative: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Sentences under a heading, each an item of a list; a text in `backticks` is what one types."""
+
+    title: str
+    items: Sequence[str]
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A page: title, banner (what to know before reading any number), facts, tables, figures."""
+    """A page: title, banner (what to know before reading any number), facts, tables, figures, sections."""
 
     title: str
     banner: str
     tables: Sequence[Table] = ()
     figures: Sequence[Figure] = ()
     facts: Sequence[tuple[str, str]] = field(default=())
+    sections: Sequence[Section] = ()
 
     def html(self) -> str:
         """Render the page."""
@@ -98,6 +108,7 @@ class Report:
             parts.append(f"<dl>{pairs}</dl>")
         parts += [_table_html(table) for table in self.tables]
         parts += [_figure_html(figure, number) for number, figure in enumerate(self.figures, 1)]
+        parts += [_section_html(section) for section in self.sections]
         return _PAGE.format(title=html.escape(self.title), style=_page_style(), body="\n".join(parts))
 
     def write(self, path: str | Path) -> None:
@@ -152,13 +163,23 @@ def _cell(table: Table, cell: str | Quantity, mark: str) -> str:
     return f"<td{mark}>{html.escape(str(cell))}</td>"
 
 
+def _section_html(section: Section) -> str:
+    items = "".join(f"<li>{_with_code(item)}</li>" for item in section.items)
+    return f"<section><h2>{html.escape(section.title)}</h2><ul>{items}</ul></section>"
+
+
+def _with_code(text: str) -> str:
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+
+
 def _figure_html(figure: Figure, number: int) -> str:
     title = html.escape(figure.title)
+    alternative = html.escape(figure.alternative or figure.title)
     if figure.image.startswith(b"\x89PNG"):
         data = base64.b64encode(figure.image).decode("ascii")
-        picture = f'<img class="paper" alt="{title}" src="data:image/png;base64,{data}">'
+        picture = f'<img class="paper" alt="{alternative}" src="data:image/png;base64,{data}">'
     else:
-        picture = _inline_svg(figure.image, figure.title, number)
+        picture = _inline_svg(figure.image, figure.title, alternative, number)
     caption = f"<p>{html.escape(figure.caption)}</p>" if figure.caption else ""
     return (
         f"<figure><figcaption><h2>Figure {number}. {title}</h2>{caption}</figcaption>"
@@ -166,7 +187,7 @@ def _figure_html(figure: Figure, number: int) -> str:
     )
 
 
-def _inline_svg(image: bytes, title: str, number: int) -> str:
+def _inline_svg(image: bytes, title: str, alternative: str, number: int) -> str:
     """Make a drawing part of the page: its ids its own, its colours the scheme's."""
     text = image.decode("utf-8")
     start = text.find("<svg")
@@ -180,7 +201,7 @@ def _inline_svg(image: bytes, title: str, number: int) -> str:
         text = text.replace(colour, f"var(--{name})")
     head_end = text.index(">")
     head = re.sub(r'\s(?:width|height)="[^"]*"', "", text[:head_end])
-    return f'{head} role="img" aria-label="{html.escape(title)}"{text[head_end:]}'
+    return f'{head} role="img" aria-label="{alternative}"{text[head_end:]}'
 
 
 def _page_style() -> str:
@@ -226,6 +247,8 @@ th,td{text-align:left;padding:.35rem .9rem .35rem 0;border-bottom:1px solid var(
 th{color:var(--muted);font-weight:600;border-bottom:1.5px solid var(--muted)}
 th.n,td.n{text-align:right;white-space:nowrap}
 th:last-child,td:last-child{padding-right:0}
+ul{margin:0;padding-left:1.2rem}
+code{background:var(--band);padding:.05rem .3rem;overflow-wrap:anywhere}
 .note,figcaption p{font-size:.88rem;color:var(--muted);margin:.4rem 0 .6rem}
 figure svg,figure img{display:block;width:100%;min-width:27rem;height:auto}
 figure img.paper{background:#fff}

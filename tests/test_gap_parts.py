@@ -10,7 +10,7 @@ from stagectl.gap import innovations
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.innovations import moments
-from stagectl.gap.log import Log, _log_of_rows
+from stagectl.gap.log import Log, log_of_rows
 from stagectl.gap.selection import Group, Judge, Sums, solve
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
@@ -169,7 +169,7 @@ def _rows(n: int = 2000) -> np.ndarray:
 
 
 def _read(rows: np.ndarray) -> Log:
-    return _log_of_rows(rows, "table", H, "1", imported=True)
+    return log_of_rows(rows, "table", H, "1", imported=True)
 
 
 def test_missing_samples_are_predicted_over_and_said():

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from stagectl import figures, report
+from stagectl import drawing, figures, report
 from stagectl.errors import RecordError, RequestError
 from stagectl.figures import BacklashCurve, ErrorTrace, Estimate, HoldTrace, TimeSeries
 from stagectl.report import Figure, Quantity, Report, Table
@@ -94,8 +94,8 @@ def test_an_unknown_image_format_is_refused():
 def test_thinning_keeps_every_peak():
     values = _RNG.standard_normal(100_003)
     values[54_321], values[77_777] = 50.0, -60.0
-    t, thin = figures._envelope(np.arange(100_003) * 1e-3, values)
-    assert thin.size < 3 * figures._LINE_BINS_COUNT
+    t, thin = drawing.envelope(np.arange(100_003) * 1e-3, values)
+    assert thin.size < 3 * drawing.LINE_BINS_COUNT
     assert (thin.max(), thin.min()) == (50.0, -60.0)
     assert t[np.argmax(thin)] == pytest.approx(54.321)
     assert (t[0], t[-1]) == (0.0, pytest.approx(100.002))

@@ -13,16 +13,17 @@ from stagectl.commands.answer import Answer, Voice
 from stagectl.commands.profiles import check_eds
 from stagectl.commands.runs import folder_of
 from stagectl.errors import ProfileError, RequestError
-from stagectl.gap import addition, arbiter
+from stagectl.gap import addition, arbiter, findings_page, plausibility, residual
 from stagectl.gap.application import Application, Change, application
 from stagectl.gap.believed import Believed, document_of, load_believed
 from stagectl.gap.findings_file import read_findings, write_findings
-from stagectl.gap.log import Log, constant_columns, read_log
+from stagectl.gap.log import Log, read_log
 from stagectl.gap.workflow import Findings, Named, find
 from stagectl.profile import Profile, search_folders
 from stagectl.whole_file import replace_whole
 
 FINDINGS = "findings.json"
+PAGE = "findings.html"
 
 
 def search(
@@ -32,18 +33,32 @@ def search(
     believed = load_believed(profile)
     logs = [_log(run, runs_root, believed) for run in training]
     apart = [_log(run, runs_root, believed) for run in held]
-    for log in [*logs, *apart]:
-        dead = constant_columns(log)
-        if dead:
-            raise RequestError(f"{log.name}: {', '.join(dead)} never changes; swapped or dead columns? Map them again")
-    findings = find(believed, logs, apart, seed=seed, say=voice.note)
+    voice.progress("checking the recordings", 0.0)
+    for remark in plausibility.check(believed, logs, apart):
+        voice.warn(remark)
+    findings = find(believed, logs, apart, seed=seed, say=lambda step: voice.progress(step, 0.0))
+    voice.progress.done()
     for remark in findings.remarks:
         voice.note(remark)
     out.mkdir(parents=True, exist_ok=True)
     write_findings(findings, out / FINDINGS)
     ladder = _ladder(believed, findings, [*logs, *apart], voice)
-    data = {"findings": asdict(findings), "file": str(out / FINDINGS), "closed_loop": ladder}
-    return Answer(data, [_named(findings), *_ladder_table(ladder), *_sentences(findings, out / FINDINGS)])
+    voice.progress("drawing the page", 0.0)
+    residuals = residual.residuals(believed, findings, logs, apart)
+    page = findings_page.page(findings, residuals, ladder, profile=profile, file=out / FINDINGS, seed=seed)
+    page.write(out / PAGE)
+    voice.progress.done()
+    data = {
+        "findings": asdict(findings),
+        "file": str(out / FINDINGS),
+        "page": str(out / PAGE),
+        "verdict": findings_page.verdict_of(findings),
+        "seed": seed,
+        "closed_loop": ladder,
+        "residual": findings_page.summary(residuals),
+    }
+    said = [*_sentences(findings, out / FINDINGS), f"Page: {out / PAGE}"]
+    return Answer(data, [_named(findings), *_ladder_table(ladder), *said])
 
 
 def apply(voice: Voice, profile: str, findings: Path, out: Path, candidates: bool, force: bool) -> Answer:
@@ -108,7 +123,7 @@ def _interval(change: Change) -> str:
 
 
 def _log(run: str, runs_root: Path, believed: Believed) -> Log:
-    return read_log(folder_of(run, runs_root), believed.period_s)
+    return read_log(folder_of(run, runs_root), believed.period_s, believed)
 
 
 def _named(findings: Findings) -> Table:
@@ -135,12 +150,7 @@ def _parameters(effect: Named) -> str:
 
 
 def _sentences(findings: Findings, path: Path) -> list[str]:
-    verdicts = {
-        "nothing": "Nothing is missing that these recordings could show.",
-        "found": "Candidates: each gains on the recordings it was fitted on and on recordings that no fit saw.",
-        "unknown": "Something repeats that no effect of the library explains; its curve is in the findings.",
-    }
-    said = [verdicts[findings.verdict]]
+    said = [findings_page.VERDICTS[findings.verdict]]
     said += [
         f"Known parameter {wrong.name} is off by {wrong.error:.3g} +- {1.96 * wrong.sd:.2g}; "
         f"the profile states {wrong.stated_sd:.2g} (one standard deviation)."

@@ -4,7 +4,8 @@ Forces of spring, damping and contact are taken on the measured relative positio
 bodies fall apart into one mass each: `stagectl.gap.innovations` whitens them one by one. Pure.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -256,6 +257,18 @@ def add(total: Forces, more: Forces) -> None:
             setattr(total, name, extra if held is None else held + extra)
 
 
+def scaled(forces: Forces, factor: float, more: Forces) -> Forces:
+    """Return `factor` times some forces, added to others."""
+    total = replace(more)
+    add(total, Forces(*(None if value is None else factor * value for value in _values_of(forces))))
+    return total
+
+
+def _values_of(forces: Forces) -> tuple[np.ndarray | None, ...]:
+    """Return the fields in their order, without copies."""
+    return tuple(getattr(forces, one.name) for one in fields(forces))
+
+
 def quantities(recording: Recording, axis: str, place: str) -> dict[str, np.ndarray]:
     """Everything that a law at one place may ask for, on parts of intervals."""
     kind = "joint" if place == "joint" else "sensor" if place.endswith("_sensor") else "force"
@@ -277,7 +290,7 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
     known = {
         "position_m": relative_m if kind == "joint" else motion.position_m,
         "velocity_m_per_s": relative_m_per_s if kind == "joint" else motion.velocity_m_per_s,
-        "acceleration_m_per_s2": motion.acceleration_m_per_s2,
+        "acceleration_m_per_s2": _believed_acceleration(recording, axis),
         "relative_position_m": relative_m,
         "relative_velocity_m_per_s": relative_m_per_s,
         "motor_force_n": motor_n,
@@ -303,6 +316,51 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
             recording.side > 0.0, joint.right_stiffness_n_per_m, joint.left_stiffness_n_per_m
         )
     return known
+
+
+def _believed_acceleration(recording: Recording, axis: str) -> np.ndarray:
+    """Return what motors and joint make of a body.
+
+    Not what positions say: their second difference holds the noise that a column of it then explains.
+    """
+    total = recording.macro_command_n if axis == "macro" else recording.micro_command_n
+    if total is None:
+        raise KeyError(axis)
+    if recording.end is not None and recording.micro_command_n is not None and recording.side is not None:
+        joint_n = joint_force_n(recording)
+        total = (
+            total + joint_n if axis == "end" else total - joint_n - recording.reaction_ratio * recording.micro_command_n
+        )
+    return total / recording.mass_kg(axis)
+
+
+def operating_point(recording: Recording, moved: Sequence[tuple[Effect, str, dict[str, float]]]) -> Recording:
+    """Return a recording with sensor errors taken out of its positions and edges where effects have put them.
+
+    moved: effects that move the joint's geometry, with their places and parameters.
+    """
+    log, believed = recording.log, recording.believed
+    for effect, place, values in moved:
+        parameters = [values[name] for name in effect.parameters]
+        axis = "macro" if place.startswith("macro") else "end"
+        known = quantities(recording, axis, place)
+        if place.endswith("_sensor"):
+            error_m = along_motion(effect, [known[name] for name in effect.quantities], parameters)[:, 0]
+            if axis == "macro":
+                log = replace(log, macro_position_m=log.macro_position_m - error_m)
+            else:
+                log = replace(log, end_position_m=recording.position_m("end") - error_m)
+        elif believed.joint is not None:
+            out_m = {}
+            for side in (-1.0, 1.0):
+                sided = known | {"contact_side_ratio": np.full_like(known["contact_side_ratio"], side)}
+                out_m[side] = float(
+                    np.mean(along_motion(effect, [sided[name] for name in effect.quantities], parameters))
+                )
+            joint = believed.joint
+            joint = replace(joint, left_m=joint.left_m + out_m[-1.0], right_m=joint.right_m + out_m[1.0])
+            believed = replace(believed, joint=joint)
+    return recording_of(log, believed)
 
 
 def _at_samples(fine: np.ndarray, fallback: np.ndarray) -> np.ndarray:

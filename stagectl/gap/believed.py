@@ -4,6 +4,7 @@ Made from a profile of ours, or from a file of the same manner for a machine tha
 `load_believed`.
 """
 
+import math
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,6 +51,7 @@ class BelievedAxis:
     latch_sd_s: float = LATCH_SD_S
     current_loop_sd_s: float = CURRENT_LOOP_SD_S
     current_noise_a: float | None = None  # of the drive's reported current; None: what it reports is not used
+    force_limit_n: float = math.inf  # of its commands
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +179,7 @@ def believed_of_observed(machine: ObservedMachine) -> Believed:
             body.current_loop_s,
             latch_s=machine.cycle.latch_s,
             latch_sd_s=machine.cycle.latch_sd_s,
+            force_limit_n=math.inf if machine.loop is None else machine.loop.limit_n,
         ),
         effects=tuple(dict(row) for row in machine.effects),
         cascade=cascade,
@@ -196,6 +199,7 @@ def believed_of_profile(profile: Profile) -> Believed:
         profile.macro.current_loop_s,
         profile.macro.rated_force_n / profile.macro.rated_current_a,
         latch_s=profile.cycle.actuation_delay_s,
+        force_limit_n=profile.macro.force_limit_n,
     )
     micro = joint = None
     if profile.micro is not None and profile.backlash is not None:
@@ -206,6 +210,7 @@ def believed_of_profile(profile: Profile) -> Believed:
             profile.micro.current_loop_s,
             profile.micro.rated_force_n / profile.micro.rated_current_a,
             latch_s=profile.cycle.actuation_delay_s,
+            force_limit_n=profile.micro.force_limit_n,
         )
         backlash = profile.backlash
         joint = BelievedJoint(

@@ -286,6 +286,23 @@ def _scope(effect: Effect, amplitudes: list[str]) -> str:
     return "run" if "run" in tags else "session" if "session" in tags else "structural"
 
 
+_STEP_RATIO = 0.02
+
+
+def deviation_term(effect: Effect, place: str, parameters: dict[str, float]) -> Term:
+    """Make the term of a change of an effect's first parameter, a ratio, where the effect is taken out already."""
+    now = [parameters[name] for name in effect.parameters]
+    later = [now[0] * (1.0 + _STEP_RATIO), *now[1:]]
+
+    def forces(r: Recording) -> list[Forces]:
+        here, there = (balance.effect_forces(r, effect, place, values) for values in (now, later))
+        return [balance.scaled(there, 1.0 / _STEP_RATIO, balance.scaled(here, -1.0 / _STEP_RATIO, Forces()))]
+
+    return Term(
+        effect.name, place, dict(parameters), ("error_ratio",), forces, "structural", ((-0.9, 2.0),), linear=False
+    )
+
+
 _SHARE_BOUNDS = (0.0, 3.0)
 _ON_BOTH_AXES = ("gravity_tilt", "base_vibration")
 """What a base does is felt by everything that stands on it."""

@@ -219,9 +219,9 @@ class Judge:
         apart = sum(s.gram[0, 0] - s.count for s in held) - gain[1]
         return max(left, 0.0), max(apart, 0.0)
 
-    def select(self, most: int = 6) -> list[Group]:
+    def select(self, start: Sequence[Group] = (), most: int = 6) -> list[Group]:
         """Add the best hypothesis as long as one stays; then let every one compete again beside the others."""
-        chosen: list[Group] = []
+        chosen = list(start)
         seen: set[frozenset[object]] = set()
         while len(chosen) < most:
             rivals = self.rivals(chosen)

@@ -3,13 +3,13 @@
 Values in, values out; same input, same answer. Pure.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from stagectl.effects import CATALOGUE
+from stagectl.effects import CATALOGUE, Effect
 from stagectl.errors import RequestError
 from stagectl.gap import balance, hypotheses, seeds
 from stagectl.gap.balance import Recording
@@ -19,12 +19,13 @@ from stagectl.gap.grids import FREE_SHAPES, grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
-from stagectl.gap.refinement import Refiner
+from stagectl.gap.refinement import Refiner, whole_of
 from stagectl.gap.selection import Group, Judge, Solution, Sums, solve
 
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
 _CURVE_SHARE = 0.03
+_DEVIATION_SD = 0.5  # of the size of an effect that is part of the operating point, a ratio
 _CORNER_RAD_PER_S = 2.0 * np.pi * 1.34
 _FORCE_N = 0.05
 _EXCITED_GAIN = 1e-6
@@ -96,67 +97,43 @@ def find(
     logs = [*training, *held]
     say("reading the motion")
     recordings = [balance.recording_of(log, believed) for log in logs]
-    for recording in recordings:
-        balance.set_noise(recording, _first_noise(believed, recording))
-    base = hypotheses.parameter_terms(recordings[0])
-    wrong = [term for term in hypotheses.wrong_parameter_terms(recordings[0]) if term.name not in without]
-    curves = list(hypotheses.curve_terms(recordings))
-    grids = grids_for(recordings)
-    terms = [term for term in hypotheses.effect_terms(recordings, grids) if term.name not in without]
-    say("looking for what repeats in position and time")
-    evidence = Evidence(recordings)
-    groups = _Groups()
-    for term, sd in base:
-        groups.add("base", evidence.add(term), term, (sd,))
-    for term in [*wrong, *terms]:
-        groups.add("library", evidence.add(term), term)
-    for term in curves:
-        groups.add("curves", evidence.add(term), term)
-    for term in _periodic_terms(evidence, groups.prior_sds()):
-        if term.name not in without:
-            groups.add("library", evidence.add(term), term)
-    evidence.finish(np.array([sd for _, sd in base]), nulls_count, seed)
-    say(f"{len(groups.library)} hypotheses of {len({g.key for g in groups.library})} names on {len(logs)} recordings")
-    judge = Judge(
-        evidence,
-        len(training),
-        groups.base,
-        groups.library,
-        lambda beside, group: Refiner(evidence, beside).refined(group),
-        lambda beside: Refiner(evidence, beside).gain_at_size,
-    )
-    say("what the library gains on noise")
+    first = Competition(recordings, len(training), nulls_count=nulls_count, seed=seed, without=without)
+    judge = first.judge
+    say(f"{len(judge.library)} hypotheses of {len({g.key for g in judge.library})} names on {len(logs)} recordings")
     judge.calibrate()
     say("effects compete")
     before = judge.reducible([])
     chosen = judge.select()
-    after = judge.reducible(chosen)
-    solution = solve([*judge.base, *chosen], evidence.sums)
-    unknown = _unknown(judge, chosen, groups.curves, evidence)
-    effects = [group for group in chosen if evidence.terms[group.columns[0]].acts_on != "parameter"]
-    named = tuple(_named(judge, chosen, group, solution, evidence) for group in effects)
+    last, named = first, _all_named(first, chosen)
+    moving = [group for group in chosen if _moves_joint(first, group)]
+    if moving:
+        say("once more, at the place where the joint is now known to be")
+        moved = tuple(_moved(first, chosen, group) for group in moving)
+        kept = tuple(first.evidence.terms[group.columns[0]] for group in chosen if group not in moving)
+        last = Competition(
+            [balance.operating_point(r, moved) for r in recordings], len(training),
+            seed=seed, without=without, moved=moved, kept=kept,
+        )  # fmt: skip
+        last.judge.thresholds = judge.thresholds
+        last.judge.trace = judge.trace
+        chosen = last.judge.select(last.kept)
+        named = _remeasured(last, chosen, named, moved) + _all_named(last, chosen)
+    after = last.judge.reducible(chosen)
+    unknown = _unknown(last, chosen, before_excess=_excess(first, []))
     verdict = "unknown" if unknown is not None else "found" if named else "nothing"
     if unknown is not None:
-        unknown["beside"] = [list(group.key) for group in effects]
+        unknown["beside"] = [[effect.name, effect.acts_on] for effect in named]
         named = ()
-    excited = {
-        group.key for group in judge.library if any(_energy(group, s) > _EXCITED_GAIN * s.count for s in judge.training)
-    }
+    solution = solve([*last.judge.base, *chosen], last.evidence.sums)
     return Findings(
         profile=believed.name,
         runs=tuple(log.name for log in training),
         holdout=tuple(log.name for log in held),
         verdict=verdict,
         named=named,
-        parameter_errors=_parameter_errors(judge, chosen, base, solution, evidence),
-        refitted=_refitted(judge, chosen, base, solution, evidence),
-        not_excited=tuple(
-            sorted(
-                f"{term.name} on {term.acts_on}"
-                for term in {t.key: t for t in terms}.values()
-                if term.key not in excited
-            )
-        ),
+        parameter_errors=_parameter_errors(last, chosen, solution),
+        refitted=_refitted(last, chosen, solution),
+        not_excited=first.not_excited(),
         unknown=unknown,
         reducible_before=before,
         reducible_after=after,
@@ -166,34 +143,120 @@ def find(
     )
 
 
+Moved = tuple[Effect, str, dict[str, float]]
+"""An effect that moves the joint's geometry or the readings, its place, its parameters."""
+
+
+class Competition:
+    """All hypotheses on recordings at one operating point, ready to compete."""
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        training_count: int,
+        *,
+        nulls_count: int = 0,
+        seed: int = 0,
+        without: frozenset[str] = frozenset(),
+        moved: tuple[Moved, ...] = (),
+        kept: tuple[Term, ...] = (),
+    ):
+        """Whiten, make the columns, sum. `moved` effects are part of the recordings already, `kept` terms start."""
+        for recording in recordings:
+            balance.set_noise(recording, _first_noise(recording.believed, recording))
+        self.evidence = evidence = Evidence(recordings)
+        self.parameters = hypotheses.parameter_terms(recordings[0])
+        self.curves: list[Group] = []
+        self.kept: list[Group] = []
+        self._sds: list[float] = []
+        base: list[Group] = []
+        library: list[Group] = []
+        for term, sd in self.parameters:
+            base.append(self._taken(term, (sd,)))
+        for effect, place, values in moved:
+            base.append(self._taken(hypotheses.deviation_term(effect, place, values), (_DEVIATION_SD,)))
+        taken = {(effect.name, place) for effect, place, _ in moved}
+        grids = grids_for(recordings)
+        wrong = hypotheses.wrong_parameter_terms(recordings[0])
+
+        def searched(terms: Iterable[Term]) -> list[Group]:
+            return [self._taken(term) for term in terms if term.name not in without and term.key not in taken]
+
+        library += searched([*wrong, *hypotheses.effect_terms(recordings, grids)])
+        self.kept += [self._taken(term) for term in kept]
+        self.curves += [self._taken(term) for term in hypotheses.curve_terms(recordings)]
+        library += searched(_periodic_terms(evidence, np.array(self._sds)))
+        evidence.finish(np.array([sd for _, sd in self.parameters]), nulls_count, seed)
+        self.judge = Judge(
+            evidence,
+            training_count,
+            base,
+            library,
+            lambda beside, group: Refiner(evidence, beside).refined(group),
+            lambda beside: Refiner(evidence, beside).gain_at_size,
+        )
+
+    def _taken(self, term: Term, sds: tuple[float, ...] | None = None) -> Group:
+        """Take a hypothesis in; without `sds` its amplitudes may be as large as its effect can be."""
+        known = sds is not None
+        sds = sds if sds is not None else _widest(term)
+        self._sds += sds
+        searched = 0 if known else max(len(FREE_SHAPES.get(term.name, ())) - (0 if term.linear else 1), 0)
+        return Group(term.key, self.evidence.add(term), term.scope, sds, term.bounds, searched)
+
+    def term(self, group: Group) -> Term:
+        """Return what a group stands for."""
+        return self.evidence.terms[group.columns[0]]
+
+    def not_excited(self) -> tuple[str, ...]:
+        """Name the effects that would not show in these recordings at any size."""
+        terms = {group.key: self.term(group) for group in self.judge.library}
+        excited = {
+            group.key
+            for group in self.judge.library
+            if any(_energy(group, s) > _EXCITED_GAIN * s.count for s in self.judge.training)
+        }
+        return tuple(sorted(f"{term.name} on {term.acts_on}" for key, term in terms.items() if key not in excited))
+
+
+def _moves_joint(search: Competition, group: Group) -> bool:
+    """Tell whether an effect puts the joint elsewhere: what was learnt of contact has to be learnt again."""
+    term = search.term(group)
+    touches = any(r.side is not None and bool(np.any(r.side)) for r in search.evidence.recordings)
+    return touches and whole_of(term) and term.acts_on.endswith(("_sensor", "contact_edge"))
+
+
+def _moved(search: Competition, chosen: list[Group], group: Group) -> Moved:
+    """Return an effect at its fitted size, sessions pooled."""
+    term = search.term(group)
+    values, sds = solve([*search.judge.base, *chosen], search.evidence.sums).of(group)
+    share = float(np.average(values, weights=1.0 / np.maximum(sds, 1e-12) ** 2))
+    first = next(iter(term.shape))
+    return CATALOGUE[term.name], term.acts_on, {**term.shape, first: share * term.shape[first]}
+
+
+def _remeasured(
+    search: Competition, chosen: list[Group], named: tuple[Named, ...], moved: tuple[Moved, ...]
+) -> tuple[Named, ...]:
+    """Return the effects that moved the joint with the sizes and intervals that hold where they have put it."""
+    solution = solve([*search.judge.base, *chosen], search.evidence.sums)
+    first = len(search.parameters)
+    found = []
+    for number, (effect, place, values) in enumerate(moved):
+        value, sd = solution.of(search.judge.base[first + number])
+        name = effect.parameters[0]
+        size = values[name]
+        before = next(one for one in named if (one.name, one.acts_on) == (effect.name, place))
+        parameters = {**values, name: size * (1.0 + float(value[0]))}
+        found.append(replace(before, parameters=parameters, sds={name: abs(size) * float(sd[0])}))
+    return tuple(found)
+
+
 def _first_noise(believed: Believed, recording: Recording) -> dict[str, Noise]:
     noise = {"macro": Noise(believed.macro.noise_m, _FORCE_N, _CORNER_RAD_PER_S, _FORCE_N * 0.1)}
     if believed.micro is not None and "end" in recording.axes:
         noise["end"] = Noise(believed.micro.noise_m, _FORCE_N, _CORNER_RAD_PER_S, _FORCE_N * 0.1)
     return noise
-
-
-class _Groups:
-    """Which columns belong to which hypothesis."""
-
-    def __init__(self) -> None:
-        self.base: list[Group] = []
-        self.library: list[Group] = []
-        self.curves: list[Group] = []
-        self._sds: list[float] = []
-
-    def add(self, kind: str, columns: tuple[int, ...], term: Term, sds: tuple[float, ...] | None = None) -> None:
-        """Take a hypothesis in; without `sds` its amplitudes may be as large as its effect can be."""
-        sds = _widest(term) if sds is None else sds
-        searched = 0
-        if kind == "library":
-            searched = max(len(FREE_SHAPES.get(term.name, ())) - (0 if term.linear else 1), 0)
-        getattr(self, kind).append(Group(term.key, columns, term.scope, sds, term.bounds, searched))
-        self._sds += sds
-
-    def prior_sds(self) -> np.ndarray:
-        """Return how large each amplitude may be, by column."""
-        return np.array(self._sds)
 
 
 def _periodic_terms(evidence: Evidence, prior_sds: np.ndarray) -> list[Term]:
@@ -219,24 +282,33 @@ def _energy(group: Group, s: Sums) -> float:
     return float(max(s.gram[c, c] for c in group.columns))
 
 
-def _named(judge: Judge, chosen: list[Group], group: Group, solution: Solution, evidence: Evidence) -> Named:
-    term = evidence.terms[group.columns[0]]
-    values, sds = solution.of(group)
-    rest = judge.gains([other for other in chosen if other is not group])
+def _all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
+    """Return every chosen effect, known parameters left out."""
+    judge, solution = search.judge, solve([*search.judge.base, *chosen], search.evidence.sums)
     whole = judge.gains(chosen)
-    parameters, errors = _readable(term, values, sds, _places(term, solution, group))
-    return Named(
-        name=term.name,
-        acts_on=term.acts_on,
-        parameters=parameters if not term.linear else term.shape | parameters,
-        sds=errors,
-        gain=whole[0] - rest[0],
-        held_out_gain=whole[1] - rest[1],
-        aliases=tuple((*key, margin) for key, margin in judge.aliases(chosen, group)),  # pyright: ignore[reportGeneralTypeIssues]
-    )
+    found = []
+    for group in chosen:
+        term = search.term(group)
+        if term.acts_on == "parameter":
+            continue
+        values, sds = solution.of(group)
+        rest = judge.gains([other for other in chosen if other is not group])
+        parameters, errors = _readable(term, values, sds, _places(solution, group))
+        found.append(
+            Named(
+                name=term.name,
+                acts_on=term.acts_on,
+                parameters=parameters if not term.linear else term.shape | parameters,
+                sds=errors,
+                gain=whole[0] - rest[0],
+                held_out_gain=whole[1] - rest[1],
+                aliases=tuple((*key, margin) for key, margin in judge.aliases(chosen, group)),  # pyright: ignore[reportGeneralTypeIssues]
+            )
+        )
+    return tuple(found)
 
 
-def _places(term: Term, solution: Solution, group: Group) -> list[str]:
+def _places(solution: Solution, group: Group) -> list[str]:
     """Name the sessions or runs that the values of a group belong to, in their order; one empty name where to none."""
     return [scope for column, scope in solution.slots if column == group.columns[0]]
 
@@ -273,18 +345,16 @@ def _readable(
     return parameters, errors
 
 
-def _parameter_errors(
-    judge: Judge, chosen: list[Group], base: list[tuple[Term, float]], solution: Solution, evidence: Evidence
-) -> tuple[ParameterError, ...]:
+def _parameter_errors(search: Competition, chosen: list[Group], solution: Solution) -> tuple[ParameterError, ...]:
     """Return the known parameters that competed with the effects and stayed, each with what would do as well."""
-    stated = {term.name: sd for term, sd in base}
+    stated = {term.name: sd for term, sd in search.parameters}
     found = []
     for group in chosen:
-        term = evidence.terms[group.columns[0]]
+        term = search.term(group)
         if term.acts_on == "parameter":
             values, sds = solution.of(group)
             own = stated.get(term.name, stated.get(_PART_OF.get(term.name, ""), 0.0))
-            aliases = tuple(str(key[0]) for key, _ in judge.aliases(chosen, group) if key[1] == "parameter")  # type: ignore[index]
+            aliases = tuple(str(key[0]) for key, _ in search.judge.aliases(chosen, group) if key[1] == "parameter")  # pyright: ignore[reportIndexIssue]
             found.append(ParameterError(term.name, float(values[0]), float(sds[0]), own, aliases))
     return tuple(found)
 
@@ -292,35 +362,42 @@ def _parameter_errors(
 _PART_OF = {"contact_stiffness_n_per_m": "left_stiffness_n_per_m", "backlash_width_m": "left_m"}
 
 
-def _refitted(
-    judge: Judge, chosen: list[Group], base: list[tuple[Term, float]], solution: Solution, evidence: Evidence
-) -> dict[str, float]:
+def _refitted(search: Competition, chosen: list[Group], solution: Solution) -> dict[str, float]:
     """Return every known parameter's error as fitted, what it is off beyond its stated uncertainty included."""
-    found = {term.name: float(solution.of(group)[0][0]) for (term, _), group in zip(base, judge.base, strict=True)}
+    base = search.judge.base[: len(search.parameters)]
+    found = {
+        term.name: float(solution.of(group)[0][0]) for (term, _), group in zip(search.parameters, base, strict=True)
+    }
     for group in chosen:
-        term = evidence.terms[group.columns[0]]
+        term = search.term(group)
         if term.acts_on == "parameter":
             value = float(solution.of(group)[0][0])
-            for name in (term.name, *(("left", "right") if term.name in _PART_OF else ())):
-                own = f"{name}{_PART_OF[term.name].removeprefix('left')}" if name in ("left", "right") else name
-                if own in found:
-                    found[own] += value
+            part = _PART_OF.get(term.name)
+            own = (part, part.replace("left", "right")) if part else (term.name,)
+            for name in own:
+                if name in found:
+                    found[name] += value
     return found
 
 
-def _unknown(judge: Judge, chosen: list[Group], curves: list[Group], evidence: Evidence) -> dict[str, Any] | None:
+def _excess(search: Competition, chosen: list[Group]) -> float:
+    """Return what is left above the noise, in squares of it."""
+    sums = search.evidence.sums
+    return sum(float(s.gram[0, 0]) - s.count for s in sums) - search.judge.gain(chosen)
+
+
+def _unknown(search: Competition, chosen: list[Group], before_excess: float) -> dict[str, Any] | None:
     """Return what no effect explains, with the curve that goes furthest, or None where the floor is reached.
 
     Names are worth stating only where with them nothing is left: a law of the library that fits an unknown force half
     is a wrong name.
     """
+    judge, evidence = search.judge, search.evidence
     count = sum(s.count for s in evidence.sums)
-    total = sum(float(s.gram[0, 0]) for s in evidence.sums)
-    left = total - count - judge.gain(chosen)
-    first = total - count - judge.gain([])
+    left, first = _excess(search, chosen), before_excess
     noise = np.sqrt(2.0 * count)
     best, gained = None, 0.0
-    for curve in curves:
+    for curve in search.curves:
         gain = judge.gain([*chosen, curve]) - judge.gain(chosen)
         if gain > gained:
             best, gained = curve, gain

@@ -1,0 +1,269 @@
+"""Whether recordings and a belief belong together at all: asked before anything is searched, so that no wrong column,
+unit or profile comes out as a missing effect.
+
+In a band in which the stage accelerates, inertia force and modelled forces must be the same thing up to what effects
+add; factors and shares are compared, so nothing depends on how large the missing effect is. Limits were set on 190
+bodies in recordings: `tests/blind` (development seeds 20 to 43), EMPS, rig runs; none of those is refused. Pure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from stagectl.errors import RequestError
+from stagectl.gap import balance, residual
+from stagectl.gap.balance import Forces, Recording
+from stagectl.gap.believed import Believed
+from stagectl.gap.log import STILL_M, Log, constant_columns
+
+_BAND_HZ = (0.2, 30.0)
+_EDGE_S = 0.3
+_BLOCK_S = 0.25  # for the error of a factor; what is left is correlated for less
+_ACCELERATING_M_PER_S2 = 0.02  # rms; 0.01 to 0.7 in the recordings looked at
+_LEAST_EXPLAINED_RATIO = 0.2  # 0.64 and more
+_FACTOR_LIMIT = 3.0  # of one recording: 0.7 to 1.05
+_FACTOR_SDS = 20.0  # of all recordings together, in what is stated of mass and force constant
+_FACTOR_SIGMAS = 6.0
+_SWAP_RATIO = 0.25  # of the squares that are left
+_SAME_RATIO = 0.5  # of the samples
+_NEAR = 3.0  # of a unit's factor: what follows velocity and position takes its share
+_SMOOTH_RATIO = 0.1
+_EDGE_SLACK_M = 5e-6
+
+_UNITS = (
+    (1e3, "positions in mm, or forces in kN"),
+    (1e6, "positions in um"),
+    (1e9, "positions in nm"),
+    (1e-3, "forces in mN"),
+    (-1.0, "a sign: of the position or of the command"),
+)
+"""Inertia force over modelled force, and the unit that makes it so."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Balance:
+    """One body in one recording, in the band: inertia force against modelled forces."""
+
+    run: str
+    axis: str
+    accelerating: bool
+    factor: float  # inertia force = factor x modelled forces + what follows velocity, its sign and position
+    factor_sd: float
+    explained_ratio: float
+    weight: float
+    left: float  # square of inertia force minus modelled forces
+
+
+def check(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> tuple[str, ...]:
+    """Refuse recordings that can't be what the belief is of; RequestError says what to look at.
+
+    Returns what is worth knowing of those that can.
+    """
+    logs = [*training, *held]
+    remarks: list[str] = []
+    for log in logs:
+        _check_columns(log)
+        if believed.micro is None and log.end_position_m is not None:
+            remarks.append(f"{log.name}: end_position_m is not used; profile {believed.name} has one axis")
+    _check_different(training, held)
+    _check_moving(training, "training")
+    if held:
+        _check_moving(held, "held-out")
+    recordings = [balance.recording_of(log, believed) for log in logs]
+    for recording in recordings:
+        _check_reference(recording)
+    balances = [_balance(recording, axis) for recording in recordings for axis in recording.axes]
+    _check_swapped(believed, recordings, balances)
+    for one in balances:
+        _check_one(believed, one)
+    for axis in recordings[0].axes:
+        _check_all(believed, recordings[0], axis, [b for b in balances if b.axis == axis and b.accelerating])
+    return tuple(remarks)
+
+
+def _check_columns(log: Log) -> None:
+    dead = constant_columns(log)
+    if dead:
+        raise RequestError(f"{log.name}: {', '.join(dead)} never changes; swapped or dead columns? Map them again")
+
+
+def _check_different(training: Sequence[Log], held: Sequence[Log]) -> None:
+    """Refuse one recording given twice, under whatever name: it would confirm itself."""
+    logs = [*training, *held]
+    for k, one in enumerate(logs):
+        for number, other in enumerate(logs[:k]):
+            if _shared_ratio(one, other) > _SAME_RATIO:
+                sides = "training and holdout" if number < len(training) <= k else "one side"
+                raise RequestError(
+                    f"{one.name} and {other.name} hold the same samples, both given as {sides}; a recording can't "
+                    "confirm itself: give each once, and record another to hold out"
+                )
+
+
+def _shared_ratio(one: Log, other: Log) -> float:
+    """Return how many of the samples of the shorter of two recordings stand in the other as well."""
+    pairs = [np.unique(np.column_stack([log.macro_position_m, log.macro_command_n]), axis=0) for log in (one, other)]
+    shorter = min(len(pairs[0]), len(pairs[1]))
+    both = np.unique(np.concatenate(pairs), axis=0)
+    return (len(pairs[0]) + len(pairs[1]) - len(both)) / shorter
+
+
+def _check_moving(logs: Sequence[Log], side: str) -> None:
+    spans_m = [
+        max(float(np.ptp(x)) for x in (log.macro_position_m, log.end_position_m) if x is not None) for log in logs
+    ]
+    if not max(spans_m) > STILL_M:
+        raise RequestError(
+            f"the {side} recordings move by {max(spans_m) * 1e6:.2g} um at most, {STILL_M * 1e6:.0f} um are needed: no "
+            "force that depends on motion is excited; record a move"
+        )
+
+
+def _check_reference(recording: Recording) -> None:
+    """Refuse a position without the sensor's noise beside a reference that has it."""
+    log = recording.log
+    stated_m = recording.belief("macro").noise_m
+    if log.reference_m is None:
+        return
+    position_m, reference_m = _noise_m(log.macro_position_m), _noise_m(log.reference_m)
+    if position_m < _SMOOTH_RATIO * stated_m and reference_m > max(0.5 * stated_m, position_m / _SMOOTH_RATIO):
+        raise RequestError(
+            f"{log.name}: setpoint_position_m has {reference_m * 1e9:.2g} nm of noise and macro_position_m "
+            f"{position_m * 1e9:.2g} nm, the sensor's is {stated_m * 1e9:.2g} nm; are the two swapped?"
+        )
+
+
+def _noise_m(position_m: np.ndarray) -> float:
+    """Return the white noise of a position from its fourth differences, in which motion is nothing."""
+    return float(np.sqrt(np.median(np.diff(position_m, 4) ** 2) / 0.455 / 70.0))
+
+
+def _in_band(recording: Recording, values: np.ndarray) -> np.ndarray:
+    h = recording.log.period_s
+    high_hz = min(_BAND_HZ[1], 0.2 / h)
+    sos = butter(4, np.array([_BAND_HZ[0], high_hz]) * 2.0 * h, btype="band", output="sos")
+    edge = round(_EDGE_S / h)
+    return np.asarray(sosfiltfilt(sos, values))[edge:-edge]
+
+
+def _balance(recording: Recording, axis: str) -> _Balance:
+    h, motion = recording.log.period_s, recording.motion(axis)
+    raw_n = residual.missing_force_n(recording, axis, Forces())
+    left_n = residual.missing_force_n(recording, axis, balance.known_forces(recording))
+    inertia_n, force_n = _in_band(recording, raw_n), _in_band(recording, raw_n - left_n)
+    velocity = motion.velocity_m_per_s.mean(axis=1)
+    others = [velocity, np.sign(velocity), motion.position_m.mean(axis=1)]
+    columns = np.column_stack([force_n, *(_in_band(recording, values) for values in others)])
+    scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-300
+    normal = np.linalg.pinv((columns / scale).T @ (columns / scale), rcond=1e-10)
+    solved = normal @ ((columns / scale).T @ inertia_n)
+    rest = inertia_n - columns / scale @ solved
+    block = round(_BLOCK_S / h)
+    count = rest.size // block
+    scores = np.einsum("ijk,ij->ik", (columns / scale)[: count * block].reshape(count, block, -1),
+                       rest[: count * block].reshape(count, block))  # fmt: skip
+    covariance = normal @ (scores.T @ scores) @ normal
+    whole = float(np.mean(inertia_n**2))
+    return _Balance(
+        run=recording.log.name,
+        axis=axis,
+        accelerating=bool(np.sqrt(whole) / recording.mass_kg(axis) > _ACCELERATING_M_PER_S2),
+        factor=float(solved[0] / scale[0]),
+        factor_sd=float(np.sqrt(covariance[0, 0]) / scale[0]),
+        explained_ratio=1.0 - float(np.mean(rest**2)) / max(whole, 1e-300),
+        weight=1.0 / max(float(normal[0, 0]) / scale[0] ** 2, 1e-300),
+        left=float(np.mean((inertia_n - force_n) ** 2)),
+    )
+
+
+def _check_swapped(believed: Believed, recordings: Sequence[Recording], balances: Sequence[_Balance]) -> None:
+    """Refuse a recording that makes far more sense with two columns exchanged, or one turned round."""
+    for recording in recordings:
+        _check_gap_side(recording)
+        own = [b for b in balances if b.run == recording.log.name]
+        left = sum(b.left for b in own)
+        for text, log in _variants(recording.log):
+            other = balance.recording_of(log, believed)
+            if sum(_balance(other, axis).left for axis in other.axes) < _SWAP_RATIO * left:
+                raise RequestError(f"{log.name}: forces and motion agree far better with {text}; map the columns again")
+
+
+def _check_gap_side(recording: Recording) -> None:
+    """Refuse bodies that stand outside their gap, and inside it the other way round: so little force tells nothing."""
+    log, joint = recording.log, recording.believed.joint
+    if joint is None or recording.end is None or log.end_position_m is None:
+        return
+    apart_m = float(np.median(log.macro_position_m - log.end_position_m))
+    slack_m = _EDGE_SLACK_M + 3.0 * joint.width_sd_m
+    outside = not -joint.left_m - slack_m <= apart_m <= joint.right_m + slack_m
+    if outside and -joint.left_m < -apart_m < joint.right_m:
+        raise RequestError(
+            f"{log.name}: macro minus end stands at {apart_m * 1e6:.0f} um, the gap reaches from "
+            f"{-joint.left_m * 1e6:.0f} to {joint.right_m * 1e6:.0f} um; are macro_position_m and end_position_m "
+            "swapped, or their zeros not those of the joint?"
+        )
+
+
+def _variants(log: Log) -> list[tuple[str, Log]]:
+    found = [("the sign of macro_force_n turned", replace(log, macro_command_n=-log.macro_command_n))]
+    end_m, micro_n = log.end_position_m, log.micro_command_n
+    if end_m is not None and micro_n is not None:
+        found += [
+            (
+                "macro_position_m and end_position_m exchanged",
+                replace(log, macro_position_m=end_m, end_position_m=log.macro_position_m),
+            ),
+            (
+                "macro_force_n and micro_force_n exchanged",
+                replace(log, macro_command_n=micro_n, micro_command_n=log.macro_command_n),
+            ),
+            ("the sign of micro_force_n turned", replace(log, micro_command_n=-micro_n)),
+        ]
+    return found
+
+
+def _check_one(believed: Believed, one: _Balance) -> None:
+    """Refuse a recording whose motion is not what its forces make."""
+    if not one.accelerating:
+        return
+    certain = abs(one.factor - 1.0) > _FACTOR_SIGMAS * one.factor_sd
+    if certain and not 1.0 / _FACTOR_LIMIT < one.factor < _FACTOR_LIMIT:
+        raise RequestError(
+            f"{one.run}: the {one.axis} accelerates {one.factor:.3g} times as much as its forces can make it"
+            f"{_unit_hint(one.factor)}; check units and columns of the import, and that {believed.name} is this "
+            "machine's profile"
+        )
+    if not one.explained_ratio > _LEAST_EXPLAINED_RATIO:
+        raise RequestError(
+            f"{one.run}: the known forces explain {max(one.explained_ratio, 0.0):.0%} of the {one.axis}'s "
+            f"acceleration, at least {_LEAST_EXPLAINED_RATIO:.0%} are needed; check that its columns are what they are "
+            f"called, and that {believed.name} is this machine's profile"
+        )
+
+
+def _check_all(believed: Believed, recording: Recording, axis: str, balances: Sequence[_Balance]) -> None:
+    """Refuse a profile whose mass the recordings contradict grossly, all together."""
+    if not balances:
+        return
+    weights = np.array([b.weight for b in balances])
+    weights = weights / weights.sum()
+    factor = float(weights @ np.array([b.factor for b in balances]))
+    sd = float(np.sqrt(weights**2 @ np.array([b.factor_sd**2 for b in balances])))
+    belief = recording.belief(axis)
+    stated = float(np.hypot(belief.mass_sd_kg / belief.mass_kg, belief.force_constant_sd_ratio))
+    if abs(factor - 1.0) > max(_FACTOR_SDS * stated, _FACTOR_SIGMAS * sd):
+        raise RequestError(
+            f"profile {believed.name}: the {axis} moves as if it had {belief.mass_kg / factor:.3g} kg, believed are "
+            f"{belief.mass_kg:.3g} kg, {abs(factor - 1.0) / stated:.0f} stated standard deviations of mass and force "
+            f"constant away (limit {_FACTOR_SDS:.0f}){_unit_hint(factor)}; is this the profile of another machine, or "
+            "the unit of a force column wrong?"
+        )
+
+
+def _unit_hint(factor: float) -> str:
+    for ratio, text in _UNITS:
+        if 1.0 / _NEAR < factor / ratio < _NEAR:
+            return f" ({text}?)"
+    return ""
