@@ -39,6 +39,7 @@ check: setup
 
 bench: setup
 	$(BIN)/python -m bench main_job --markdown docs/figures.md
+	$(BIN)/python -m bench gap --markdown docs/figures-gap.md
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from bench.figure import Figure
 
-NAMES = ("main_job",)
+NAMES = ("gap", "main_job")
 
 
 def _arguments(argv: list[str] | None) -> argparse.Namespace:
@@ -53,12 +53,12 @@ def table(figures: Iterable[Figure]) -> str:
     return "\n".join(lines)
 
 
-def _page(name: str, figures: list[Figure], load: str, took_s: float) -> str:
+def _page(name: str, about: str, figures: list[Figure], load: str, took_s: float) -> str:
     day = time.strftime("%Y-%m-%d")
     return (
         f"# Figures: {name}\n\n"
         f"Written by `make bench` on {day}; {took_s:.0f} s on {os.cpu_count()} CPUs. {load}\n"
-        "Where there are several seeds the worst of them stands here. Bars are written in `bench/main_job.py`.\n\n"
+        f"{about}\n\n"
         f"{table(figures)}\n"
     )
 
@@ -84,7 +84,7 @@ def main(argv: list[str] | None = None) -> int:
         arguments.out.write_text(text + "\n")
     if arguments.markdown is not None:
         arguments.markdown.parent.mkdir(parents=True, exist_ok=True)
-        arguments.markdown.write_text(_page(arguments.name, figures, load, time.monotonic() - begin_s))
+        arguments.markdown.write_text(_page(arguments.name, module.ABOUT, figures, load, time.monotonic() - begin_s))
     return 1 if any(figure.holds is False for figure in figures) else 0
 
 

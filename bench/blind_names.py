@@ -72,7 +72,8 @@ def _asymmetry(forward: str, backward: str) -> Reading:
 
 
 def _angle(ours: Mapping[str, float]) -> float:
-    return -math.asin(ours.get("grade_ratio", math.nan))
+    grade = ours.get("grade_ratio", math.nan)
+    return -math.asin(grade) if abs(grade) <= 1.0 else math.nan
 
 
 def _loss_at_100_n(ours: Mapping[str, float]) -> float:
@@ -294,17 +295,17 @@ def our_keys(name: str, acts_on: str) -> tuple[Key, ...]:
     )
 
 
-def in_words_of_the_truth(findings: Findings, starts_s: Mapping[str, float]) -> dict[str, Any]:
-    """Translate findings into what `tests.blind.score` marks; `starts_s`: session time at each run's start, by name."""
+def in_words_of_the_truth(findings: Findings) -> dict[str, Any]:
+    """Translate findings into what `tests.blind.score` marks."""
     return {
         "verdict": findings.verdict,
-        "effects": _effects(findings.named, starts_s),
+        "effects": _effects(findings.named),
         "parameter_errors": _parameter_errors(findings.parameter_errors),
         "not_excited": list(findings.not_excited),
     }
 
 
-def _effects(named: Sequence[Named], starts_s: Mapping[str, float]) -> list[dict[str, Any]]:
+def _effects(named: Sequence[Named]) -> list[dict[str, Any]]:
     """Merge what the truth states as one: a law beside its Coulomb friction, and what both axes feel."""
     left = list(named)
     found: list[dict[str, Any]] = []
@@ -315,11 +316,11 @@ def _effects(named: Sequence[Named], starts_s: Mapping[str, float]) -> list[dict
         if translation is None:
             found.append({"name": one.name, "acts_on": acts_on, "alias_set": _aliases(one), "parameters": {}})
             continue
-        values, sds = _plain(one, starts_s)
+        values, sds = _plain(one)
         aliases = _aliases(one)
         for other in left:
             if other is not one and (other.name, other.acts_on) == (translation.beside, one.acts_on):
-                more, more_sds = _plain(other, starts_s)
+                more, more_sds = _plain(other)
                 values, sds = more | values, more_sds | sds
                 left = [kept for kept in left if kept is not other]
                 found = [kept for kept in found if (kept["name"], kept["acts_on"]) != (other.name, acts_on)]
@@ -344,7 +345,7 @@ def _aliases(one: Named) -> list[list[str]]:
     return [list(key) for key in keys if key != truth_key(one.name, one.acts_on)]
 
 
-def _plain(one: Named, starts_s: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
+def _plain(one: Named) -> tuple[dict[str, float], dict[str, float]]:
     """Pool what was fitted session by session, or run by run, into one value each: the truth has one amplitude."""
     values: dict[str, float] = {}
     sds: dict[str, float] = {}
@@ -357,20 +358,12 @@ def _plain(one: Named, starts_s: Mapping[str, float]) -> tuple[dict[str, float],
             if sd is not None:
                 sds[name] = sd
         elif sd is not None:
-            scale = _of_whole_drift(one, place, starts_s)
-            pooled.setdefault(name, []).append((scale * value, scale * sd))
+            pooled.setdefault(name, []).append((value, sd))
     for name, pairs in pooled.items():
         weights = [1.0 / max(sd, 1e-300) ** 2 for _, sd in pairs]
         values[name] = sum(w * value for w, (value, _) in zip(weights, pairs, strict=True)) / sum(weights)
         sds[name] = 1.0 / math.sqrt(sum(weights))
     return values, sds
-
-
-def _of_whole_drift(one: Named, run: str, starts_s: Mapping[str, float]) -> float:
-    """Return how much larger the drift of the session is than what a run that starts late still sees of it."""
-    if one.name != "thermal_drift" or "time_constant_s" not in one.parameters:
-        return 1.0
-    return math.exp(starts_s.get(run, 0.0) / one.parameters["time_constant_s"])
 
 
 def _finite(values: dict[str, float]) -> dict[str, float]:

@@ -47,7 +47,6 @@ class BlindSet:
     believed: Believed
     logs: tuple[Log, ...]
     gains: tuple[dict[str, float], ...]  # of each run's controller
-    starts_s: dict[str, float]  # session time at the start of each run, by the log's name
     relative_reference_m: tuple[np.ndarray | None, ...]
 
 
@@ -61,7 +60,6 @@ def load_set(folder: Path) -> BlindSet:
         _believed(folder.name, modeller),
         tuple(_log(run, table, period_s) for run, table in zip(runs, tables, strict=True)),
         tuple(run["gains"] for run in runs),
-        {Path(run["file"]).stem: run["starts_at_session_s"] for run in runs},
         tuple(table.get("relative_reference_m") for table in tables),
     )
 
@@ -262,7 +260,7 @@ def search(job: Job) -> Searched:
         return Searched(
             job.seed,
             truth,
-            in_words_of_the_truth(findings, blind.starts_s),
+            in_words_of_the_truth(findings),
             len(held),
             (findings.reducible_before[1], findings.reducible_after[1]),
             float(np.sqrt(2.0 * samples_count)),  # of a sum of so many squares of unit variance
@@ -274,10 +272,15 @@ def search(job: Job) -> Searched:
         return Searched(job.seed, truth, NOTHING, 0, (0.0, 0.0), 0.0, time.monotonic() - begin_s, text)
 
 
-def searched(jobs: Sequence[Job], workers: int) -> Iterator[Searched]:
-    """Search sets, each in a process of its own pool, in the order in which they end."""
+def searched(jobs: Sequence[Job], workers: int, until_s: float = float("inf")) -> Iterator[Searched]:
+    """Search sets, each in a process of its own pool, in the order in which they end.
+
+    What has not begun at `until_s` of the monotonic clock is left out; sets begin in the order given.
+    """
     if workers <= 1:
-        yield from map(search, jobs)
+        for job in jobs:
+            if time.monotonic() < until_s:
+                yield search(job)
         return
     for name in _THREADS:  # heard by the workers: they must not fight for the processors
         os.environ.setdefault(name, str(max(1, (os.cpu_count() or 1) // workers)))
@@ -285,6 +288,11 @@ def searched(jobs: Sequence[Job], workers: int) -> Iterator[Searched]:
     with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
         waiting = {pool.submit(search, job): job for job in jobs}
         for future in concurrent.futures.as_completed(waiting):
+            if time.monotonic() >= until_s:
+                for other in waiting:
+                    other.cancel()
+            if future.cancelled():
+                continue
             job = waiting[future]
             try:
                 yield future.result()
@@ -392,9 +400,8 @@ def summary_lines(all_marked: Sequence[Marked]) -> list[str]:
             f"{row['figure']:<12} {row['right']:>3}/{row['count']:<3} {share} "
             f"({100 * low:.0f} to {100 * high:.0f} %), bar {100 * row['bar']:.0f} % {verdict}"
         )
-    for name in ("parameter_error_median", "coverage", "mean_set_size", "mean_own_set_size"):
-        if result[name] is not None:
-            lines.append(f"{name.replace('_', ' ')}: {result[name]:.3g}")
+    means = ("parameter_error_median", "coverage", "mean_set_size", "mean_own_set_size")
+    lines += [f"{name.replace('_', ' ')}: {result[name]:.3g}" for name in means if result[name] is not None]
     lines.append(f"reducible gap closed: {closed_text(all_marked)}")
     for name, row in result["by_name"].items():
         lines.append(

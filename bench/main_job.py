@@ -23,6 +23,8 @@ from stagectl.errors import StagectlError
 from stagectl.profile import load_profile
 from stagectl.tracker import LAW_NAMES
 
+ABOUT = "Where there are several seeds the worst of them stands here. Bars are written in `bench/main_job.py`."
+
 STAGE = "oled-printer"
 IDENTIFICATION_NOISE_M = 100e-9
 IDENTIFICATION_S = 20.0

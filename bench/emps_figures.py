@@ -1,0 +1,99 @@
+"""The gap workflow on EMPS, blind from mass and viscous friction: names, closed-loop force gap, time."""
+
+import time
+from collections.abc import Callable, Iterator
+
+from bench import emps
+from bench.figure import Bar, Figure, absent, judged
+from stagectl.errors import StagectlError
+from stagectl.gap import addition, arbiter
+from stagectl.gap.believed import Believed
+from stagectl.gap.log import Log
+from stagectl.gap.workflow import Findings, Named, find
+
+RIGHT = Bar("EMPS: Coulomb, offset, asymmetric viscous friction, 2.5 mm force: named", "of 4", 4.0, at_least=True)
+WRONG = Bar("EMPS: names of what it lacks", "names", 0.0)
+TRAINING = Bar("EMPS: closed-loop force gap, training", "N", 2.0)
+HELD = Bar("EMPS: closed-loop force gap, PULSES", "N", 2.85)
+LOW_SPEED = Bar("EMPS: closed-loop force gap, training, a low-speed law among the names", "N", 1.35)
+TIME = Bar("EMPS: time", "s", 30.0)
+_ALL = (RIGHT, WRONG, TRAINING, HELD, LOW_SPEED, TIME)
+
+PITCH_M = (2.48e-3, 2.52e-3)
+_LOW_SPEED_LAWS = frozenset({"sublinear_viscous_friction", "dahl_friction", "lugre_friction"})
+
+Say = Callable[[str], None]
+
+
+def figures(say: Say) -> Iterator[Figure]:
+    """Measure every row, or say why not."""
+    folder = emps.folder()
+    if folder is None:
+        yield from (absent(bar, "STAGECTL_DATA names no folder with emps/DATA_EMPS.mat") for bar in _ALL)
+        return
+    say("EMPS, twice: the first search compiles")
+    believed, training, held = emps.read(folder)
+    find(believed, training, held)
+    begin_s = time.monotonic()
+    findings = find(believed, training, held)
+    took_s = time.monotonic() - begin_s
+    said = ", ".join(_text(one) for one in findings.named) or "nothing"
+    say(f"  {took_s:.1f} s: {said}")
+    yield judged(RIGHT, len(right_names(findings)), reason=f"named: {said}")
+    wrong = wrong_names(findings)
+    yield judged(WRONG, len(wrong), reason=", ".join(sorted(wrong)))
+    gaps_n = [force_gap_n(believed, findings, log) for log in (training[0], held[0])]
+    names = {one.name for one in findings.named}
+    yield _gap(TRAINING, gaps_n[0])
+    yield _gap(HELD, gaps_n[1])
+    if names & _LOW_SPEED_LAWS:
+        yield _gap(LOW_SPEED, gaps_n[0])
+    else:
+        yield absent(LOW_SPEED, "no low-speed law was named")
+    yield judged(TIME, took_s, reason="one search, warm")
+
+
+def _text(one: Named) -> str:
+    aliases = "".join(f" / {name}" for name, _, _ in one.aliases)
+    pitch_m = one.parameters.get("pitch_m")
+    return one.name + ("" if pitch_m is None else f" of {pitch_m * 1e3:.3f} mm") + aliases
+
+
+def _gap(bar: Bar, value: float | str) -> Figure:
+    """Hold a gap against its bar; a simulation that could not run holds none."""
+    if isinstance(value, str):
+        return Figure(bar.figure, None, bar.unit, bar.text, False, [], value)
+    return judged(bar, value)
+
+
+def right_names(findings: Findings) -> set[str]:
+    """Return which of the machine's effects are named, or stand in the alias set of a name."""
+    stated: set[str] = set()
+    for one in findings.named:
+        names = {one.name} | {alias[0] for alias in one.aliases}
+        if "asymmetric_coulomb_friction" in names:  # a level for each direction is one level and an offset
+            names |= {"coulomb_friction", "offset"}
+        if names & {"cogging", "harmonic_cogging"}:
+            names.discard("cogging")
+            if PITCH_M[0] <= one.parameters.get("pitch_m", 0.0) <= PITCH_M[1]:
+                names.add("cogging")
+        stated |= names
+    return stated & set(emps.RIGHT)
+
+
+def wrong_names(findings: Findings) -> set[str]:
+    """Return names of what the machine lacks; tilt may stand in the alias set of an offset."""
+    return {one.name for one in findings.named} & set(emps.WRONG)
+
+
+def force_gap_n(believed: Believed, findings: Findings, log: Log) -> float | str:
+    """Simulate the closed loop with all that was found; why not, where it can't be."""
+    problem = arbiter.cannot_close(believed, log)
+    if problem:
+        return problem
+    effects = addition.effects_with(believed, findings, findings.named, log.session)
+    try:
+        simulated = arbiter.simulate(believed, effects, log, 1.0 + findings.refitted.get("macro_mass_kg", 0.0))
+    except StagectlError as error:
+        return str(error)
+    return arbiter.gap_of(log, simulated).command_n

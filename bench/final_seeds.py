@@ -1,0 +1,119 @@
+"""Final seeds are for a result, not for development: every run over them is written down before it begins.
+
+The record is a committed file. A run that was cut short goes on where it stopped, as long as no source has changed; any
+other start counts as one more run.
+"""
+
+import dataclasses
+import hashlib
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from bench.blind_sets import Searched
+from bench.figure import Figure
+
+FIRST_SEED = 1_000_000
+ROOT = Path(__file__).parent.parent
+RECORD = ROOT / "docs" / "gap-results.json"
+_SOURCES = ("stagectl", "bench", "tests/blind")
+
+
+def sources_digest() -> str:
+    """Return a hash of everything that a result depends on: the workflow, the bench, the generator."""
+    digest = hashlib.sha256()
+    for folder in _SOURCES:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def commit() -> str:
+    """Return the commit, with a mark where the sources differ from it."""
+    try:
+        name = _git("rev-parse", "HEAD")
+        changed = _git("status", "--porcelain", "--", *_SOURCES)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown: no git here"
+    return f"{name}, with changes" if changed else name
+
+
+def _git(*arguments: str) -> str:
+    done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True, timeout=60)
+    return done.stdout.strip()
+
+
+def _now() -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+
+
+@dataclasses.dataclass(slots=True)
+class FinalRun:
+    """One run over the final seeds: its entry in the record, and what it has so far."""
+
+    record: Path
+    digest: str
+    number: int
+    journal: Path
+
+    def keep(self, one: Searched) -> None:
+        """Keep what was found on one set, so that a run that is cut short need not search it again."""
+        path = self.journal / f"{one.seed}.json"
+        path.with_suffix(".part").write_text(json.dumps(dataclasses.asdict(one)))
+        path.with_suffix(".part").replace(path)
+
+    def kept(self) -> dict[int, Searched]:
+        """Return what was found before this run was cut short."""
+        found: dict[int, Searched] = {}
+        for path in self.journal.glob("*.json"):
+            row = json.loads(path.read_text())
+            found[row["seed"]] = Searched(**{**row, "reducible": tuple(row["reducible"])})
+        return found
+
+    def end(self, seeds: Iterable[int], figures: Iterable[Figure], took_s: float) -> None:
+        """Write the result into the record."""
+        content = _read(self.record)
+        row = content["runs"][self.number - 1]
+        ordered = sorted(seeds)
+        row |= {
+            "ended": _now(),
+            "seeds": f"{ordered[0]}-{ordered[-1]}",
+            "sets": len(ordered),
+            "took_s": round(row.get("took_s", 0.0) + took_s, 1),
+            "figures": [figure.as_json() | {"seeds": []} for figure in figures],
+        }
+        _write(self.record, content)
+
+
+def begin(record: Path = RECORD, journals: Path | None = None) -> FinalRun:
+    """Count this run in the record, or go on with one that was cut short on the same sources."""
+    digest = sources_digest()
+    journal = (journals or Path(tempfile.gettempdir())) / f"stagectl-gap-final-{digest}"
+    content = _read(record)
+    for row in content["runs"]:
+        if row["sources"] == digest and row["ended"] is None and journal.is_dir():
+            row["continued"] = [*row.get("continued", []), _now()]
+            _write(record, content)
+            return FinalRun(record, digest, row["number"], journal)
+    number = len(content["runs"]) + 1
+    journal.mkdir(parents=True, exist_ok=True)
+    for path in journal.iterdir():  # of an earlier run that did end
+        path.unlink()
+    content["runs"].append({"number": number, "commit": commit(), "sources": digest, "begun": _now(), "ended": None})
+    _write(record, content)
+    return FinalRun(record, digest, number, journal)
+
+
+def _read(record: Path) -> dict[str, Any]:
+    return json.loads(record.read_text()) if record.exists() else {"runs": []}
+
+
+def _write(record: Path, content: dict[str, Any]) -> None:
+    content = {"final_seeds_were_run": len(content["runs"]), "runs": content["runs"]}
+    part = record.with_suffix(".part")
+    part.write_text(json.dumps(content, indent=1) + "\n")
+    part.replace(record)
