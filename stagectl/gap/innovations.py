@@ -119,7 +119,7 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
 def smoothed(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
     """Return (position, velocity, slow force) at the samples as forward and backward passes see them, (n,) each.
 
-    The Rauch-Tung-Striebel smoother of the filter above (AIAA Journal 3(8), 1965).
+    The smoother of the filter above after Bierman (Factorization Methods, 1977, X.3): no covariance is inverted.
     """
     n = position_m.size
     h = period_s
@@ -134,38 +134,38 @@ def smoothed(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, fo
     steady[2, 2] = force_n * force_n
     steady[2, 3] = steady[3, 2] = steady[2, 2]
     steady[3, 3] = 2.0 * steady[2, 2]
-    drive = steady - a @ steady @ a.T
+    moved = a @ steady @ a.T
+    drive = np.zeros((_STATES, _STATES))
+    drive[2:, 2:] = steady[2:, 2:] - moved[2:, 2:]
     p = steady.copy()
     p[0, 0] = _START_SD[0] ** 2 + sensor_m * sensor_m
     p[1, 1] = _START_SD[1] ** 2
-    before, after = np.zeros((n, _STATES)), np.zeros((n, _STATES))
-    before_p, after_p = np.zeros((n, _STATES, _STATES)), np.zeros((n, _STATES, _STATES))
+    before, spread, gain = np.zeros((n, _STATES)), np.zeros((n, _STATES, _STATES)), np.zeros((n, _STATES))
+    share, z = np.zeros(n), np.zeros(n)  # of innovations: one over their variance, 0 where nothing was measured
     x = np.zeros(_STATES)
     x[0] = position_m[0]
     pull = np.zeros(_STATES)
     for k in range(n):
         before[k] = x
-        before_p[k] = p
+        spread[k] = p
         if valid[k]:
-            gain = p[:, 0] / (p[0, 0] + sensor_m * sensor_m)
-            x = x + gain * (position_m[k] - x[0])
-            p = p - np.outer(gain, p[0])
-        after[k] = x
-        after_p[k] = p
+            share[k] = 1.0 / (p[0, 0] + sensor_m * sensor_m)
+            gain[k] = p[:, 0] * share[k]
+            z[k] = position_m[k] - x[0]
+            x = x + gain[k] * z[k]
+            p = p - np.outer(gain[k], p[0])
         pull[0] = 0.5 * h * h * early_n[k] / mass_kg
         pull[1] = h * mean_n[k] / mass_kg
         x = a @ x + pull
         p = a @ p @ a.T + drive
         p = 0.5 * (p + p.T)
-    out = after.copy()
-    scale = np.zeros(_STATES)
-    for i in range(n - 1):
-        k = n - 2 - i
-        for j in range(_STATES):
-            scale[j] = np.sqrt(before_p[k + 1, j, j])
-        weights = np.outer(scale, scale)
-        inverse = np.linalg.inv(before_p[k + 1] / weights + 1e-12 * np.eye(_STATES)) / weights
-        out[k] += after_p[k] @ a.T @ inverse @ (out[k + 1] - before[k + 1])
+    out = np.zeros((n, _STATES))
+    pending = np.zeros(_STATES)  # what later samples say of the state after this one
+    for i in range(n):
+        k = n - 1 - i
+        pending[0] -= share[k] * z[k] + gain[k] @ pending
+        out[k] = before[k] - spread[k] @ pending
+        pending = a.T @ pending
     return out[:, 0].copy(), out[:, 1].copy(), out[:, 2].copy()
 
 

@@ -27,8 +27,8 @@ from stagectl.gap.believed import Believed
 from stagectl.gap.grids import grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.log import Log
+from stagectl.gap.noise import noise_of
 from stagectl.gap.workflow import Findings, Named
-from stagectl.gap.workflow import _first_noise as first_noise
 
 SIGMAS = 1.96
 """Of a 95 % interval."""
@@ -243,7 +243,7 @@ def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Ou
 def prepared(log: Log, believed: Believed) -> Recording:
     """Prepare a log with the noise that the search begins with."""
     recording = balance.recording_of(log, believed)
-    balance.set_noise(recording, first_noise(believed, recording))
+    balance.set_noise(recording, noise_of([recording]))
     return recording
 
 

@@ -48,8 +48,6 @@ class Refiner:
     def refined(self, group: Group) -> Group:
         """Return the group at its best shape, as new columns; the same group where nothing is to be searched."""
         term = self._evidence.terms[group.columns[0]]
-        if term.acts_on == "parameter":
-            return group
         free = FREE_SHAPES.get(term.name, ())
         entire = whole_of(term)
         if not free and not entire:
@@ -185,6 +183,8 @@ def scopes_of(scope: str, sums: Sequence[Sums]) -> tuple[str, ...]:
 
 def whole_of(term: Term) -> bool:
     """Tell whether an effect has to be taken at its size: its column is only the beginning of what it does."""
+    if term.acts_on == "parameter":
+        return False
     effect = CATALOGUE[term.name]
     moves = term.acts_on == "contact_edge" or (term.acts_on.endswith("_sensor") and term.name != "cyclic_error")
     return moves or not effect.linear

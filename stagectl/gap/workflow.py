@@ -19,6 +19,7 @@ from stagectl.gap.grids import FREE_SHAPES, grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
+from stagectl.gap.noise import noise_of
 from stagectl.gap.refinement import Refiner, whole_of
 from stagectl.gap.selection import Group, Judge, Solution, Sums, solve
 
@@ -26,8 +27,6 @@ _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
 _CURVE_SHARE = 0.03
 _DEVIATION_SD = 0.5  # of the size of an effect that is part of the operating point, a ratio
-_CORNER_RAD_PER_S = 2.0 * np.pi * 1.34
-_FORCE_N = 0.05
 _EXCITED_GAIN = 1e-6
 
 Say = Callable[[str], None]
@@ -112,7 +111,7 @@ def find(
         kept = tuple(first.evidence.terms[group.columns[0]] for group in chosen if group not in moving)
         last = Competition(
             [balance.operating_point(r, moved) for r in recordings], len(training),
-            seed=seed, without=without, moved=moved, kept=kept,
+            seed=seed, without=without, moved=moved, kept=kept, noise=first.noise,
         )  # fmt: skip
         last.judge.threshold = judge.threshold
         last.judge.trace = judge.trace
@@ -160,10 +159,12 @@ class Competition:
         without: frozenset[str] = frozenset(),
         moved: tuple[Moved, ...] = (),
         kept: tuple[Term, ...] = (),
+        noise: dict[str, Noise] | None = None,
     ):
         """Whiten, make the columns, sum. `moved` effects are part of the recordings already, `kept` terms start."""
+        self.noise = noise_of(recordings) if noise is None else noise
         for recording in recordings:
-            balance.set_noise(recording, _first_noise(recording.believed, recording))
+            balance.set_noise(recording, self.noise)
         self.evidence = evidence = Evidence(recordings)
         self.parameters = hypotheses.parameter_terms(recordings[0])
         self.curves: list[Group] = []
@@ -250,13 +251,6 @@ def _remeasured(
         parameters = {**values, name: size * (1.0 + float(value[0]))}
         found.append(replace(before, parameters=parameters, sds={name: abs(size) * float(sd[0])}))
     return tuple(found)
-
-
-def _first_noise(believed: Believed, recording: Recording) -> dict[str, Noise]:
-    noise = {"macro": Noise(believed.macro.noise_m, _FORCE_N, _CORNER_RAD_PER_S, _FORCE_N * 0.1)}
-    if believed.micro is not None and "end" in recording.axes:
-        noise["end"] = Noise(believed.micro.noise_m, _FORCE_N, _CORNER_RAD_PER_S, _FORCE_N * 0.1)
-    return noise
 
 
 def _periodic_terms(evidence: Evidence, prior_sds: np.ndarray) -> list[Term]:

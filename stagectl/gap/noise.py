@@ -1,0 +1,64 @@
+"""What disturbs a stage besides its slow force: force noise, read off the innovations where no law reaches.
+
+A force that is independent from sample to sample reddens the innovations of a filter that knows nothing of it. How
+much there is is what makes them white. Bursts, a friction that turns around, are in few stretches: the middle one of
+all counts. Pure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from stagectl.gap import balance
+from stagectl.gap.balance import Recording
+from stagectl.gap.believed import Believed
+from stagectl.gap.innovations import Noise
+
+SLOW_FORCE_N = 0.05
+SLOW_CORNER_RAD_PER_S = 2.0 * np.pi * 1.34
+"""The force that nobody models, where a profile says nothing of it: 0.05 N rms below 2 Hz, falling with the square."""
+
+_FORCES_N = (0.0, *(1e-3 * 2.0**k for k in range(14)))
+_STRETCH = 512
+_LOW, _HIGH = (0.06, 0.2), (0.3, 0.5)  # shares of the sample rate
+_WHITE_RATIO = 1.08
+
+
+def slow_noise(believed: Believed, recording: Recording) -> dict[str, Noise]:
+    """Return what is believed of each body before its recordings are looked at."""
+    noise = {"macro": Noise(believed.macro.noise_m, SLOW_FORCE_N, SLOW_CORNER_RAD_PER_S, 0.0)}
+    if believed.micro is not None and "end" in recording.axes:
+        noise["end"] = Noise(believed.micro.noise_m, SLOW_FORCE_N, SLOW_CORNER_RAD_PER_S, 0.0)
+    return noise
+
+
+def noise_of(recordings: Sequence[Recording]) -> dict[str, Noise]:
+    """Return slow force, force noise and sensor noise of each body, the force noise from all recordings together."""
+    noise = slow_noise(recordings[0].believed, recordings[0])
+    for axis, level in noise.items():
+        low, high = 0, len(_FORCES_N) - 1
+        while low < high:  # the ratio falls with the force noise that the filter expects
+            middle = (low + high) // 2
+            if _redness(recordings, axis, replace(level, white_force_n=_FORCES_N[middle])) <= _WHITE_RATIO:
+                high = middle
+            else:
+                low = middle + 1
+        noise[axis] = replace(level, white_force_n=_FORCES_N[low])
+    return noise
+
+
+def _redness(recordings: Sequence[Recording], axis: str, level: Noise) -> float:
+    """Return the innovations' power at middle over that at high frequencies, in the middle one of all stretches."""
+    ratios = []
+    for recording in recordings:
+        balance.set_noise(recording, {name: level for name in recording.axes})
+        z = balance.observed(recording)[recording.axes.index(axis)]
+        count = z.size // _STRETCH
+        if not count:
+            continue
+        power = np.abs(np.fft.rfft(z[: count * _STRETCH].reshape(count, _STRETCH) * np.hanning(_STRETCH), axis=1)) ** 2
+        share = np.fft.rfftfreq(_STRETCH)
+        low, high = (power[:, (share > band[0]) & (share < band[1])].mean(axis=1) for band in (_LOW, _HIGH))
+        ratios.append(low / np.maximum(high, 1e-300))
+    return float(np.median(np.concatenate(ratios))) if ratios else 0.0
