@@ -105,15 +105,20 @@ class Recording:
 def recording_of(log: Log, believed: Believed) -> Recording:
     """Prepare a log: motion, commands on parts of intervals, contact geometry."""
     rough = _recording(log, believed, motion_of(log.macro_position_m, log.period_s, believed.macro.noise_m), None)
-    forces = known_forces(rough)
+    return smoothed_under(rough, known_forces(rough))
+
+
+def smoothed_under(recording: Recording, forces: Forces) -> Recording:
+    """Return a recording whose motion is smoothed once more, under the forces that are now thought to act."""
+    log, believed = recording.log, recording.believed
     motions: list[Motion | None] = [None, None]
     for k, (axis, force_n) in enumerate(zip(AXES, (forces.macro_n, forces.end_n), strict=True)):
-        if axis in rough.axes and force_n is not None:
+        if axis in recording.axes and force_n is not None:
             motions[k] = motion_under(
-                rough.motion(axis), rough.position_m(axis), log.valid, force_n, rough.mass_kg(axis),
-                log.period_s, rough.belief(axis).noise_m,
+                recording.motion(axis), recording.position_m(axis), log.valid, force_n, recording.mass_kg(axis),
+                log.period_s, recording.belief(axis).noise_m,
             )  # fmt: skip
-    return _recording(log, believed, motions[0] or rough.macro, motions[1])
+    return _recording(log, believed, motions[0] or recording.macro, motions[1])
 
 
 def _recording(log: Log, believed: Believed, macro: Motion, end: Motion | None) -> Recording:
@@ -377,10 +382,20 @@ def operating_point(recording: Recording, moved: Sequence[tuple[Effect, str, dic
                 out_m[side] = float(
                     np.mean(along_motion(effect, [sided[name] for name in effect.quantities], parameters))
                 )
-            joint = believed.joint
-            joint = replace(joint, left_m=joint.left_m + out_m[-1.0], right_m=joint.right_m + out_m[1.0])
-            believed = replace(believed, joint=joint)
+            believed = _edges_out(believed, out_m[-1.0], out_m[1.0])
     return recording_of(log, believed)
+
+
+def with_edges_moved(recording: Recording, left_out_m: float, right_out_m: float) -> Recording:
+    """Return a recording whose joint has its edges further out."""
+    return recording_of(recording.log, _edges_out(recording.believed, left_out_m, right_out_m))
+
+
+def _edges_out(believed: Believed, left_m: float, right_m: float) -> Believed:
+    joint = believed.joint
+    if joint is None:
+        return believed
+    return replace(believed, joint=replace(joint, left_m=joint.left_m + left_m, right_m=joint.right_m + right_m))
 
 
 def _at_samples(fine: np.ndarray) -> np.ndarray:

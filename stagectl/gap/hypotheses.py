@@ -332,6 +332,7 @@ def phase_of(effect: Effect, amplitude: str) -> str | None:
 
 
 _KNOTS_COUNT = 12
+_LEAST_CURVE_N = 1.0  # as large as what drives, or so much: free, curves and known parameters cancel out at kilonewtons
 _CURVES = ("position_m", "velocity_m_per_s", "t_s")  # not acceleration: its line is a mass, and shrinks any rest
 
 
@@ -355,4 +356,6 @@ def curve_terms(recordings: list[Recording]) -> Iterator[Term]:
 
             place = "macro_force" if axis == "macro" else "micro_force"
             names = tuple(f"{knot:.6g}" for knot in knots)
-            yield Term(f"curve over {quantity}", place, {}, names, forces)
+            commands = [r.log.macro_command_n if axis == "macro" else r.log.micro_command_n for r in recordings]
+            most_n = max(_LEAST_CURVE_N, *(float(np.std(c)) for c in commands if c is not None))
+            yield Term(f"curve over {quantity}", place, {}, names, forces, bounds=((-most_n, most_n),) * _KNOTS_COUNT)

@@ -32,6 +32,7 @@ class Motion:
     velocity_m_per_s: np.ndarray
     acceleration_m_per_s2: np.ndarray
     slow: np.ndarray
+    measured_m_per_s2: np.ndarray  # acceleration by the positions alone, shape (n,)
 
 
 def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motion:
@@ -56,7 +57,7 @@ def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motio
     wide = (np.convolve(slow, np.ones(3), "same") > 0.5) | (
         np.convolve(rests, np.ones(2 * _REST_REACH + 1), "same") > 0.5
     )
-    return Motion(position, velocity, acceleration, wide)
+    return Motion(position, velocity, acceleration, wide, a)
 
 
 _SMOOTHING_RAD_PER_S = 2.0 * np.pi * 20.0
@@ -73,7 +74,7 @@ def motion_under(
     made of the velocity, fitted noise (a gain of 149 on clean data); what commands do to the motion needs no smoothing.
     How far the believed forces can be trusted is read off the rough motion.
     """
-    apart_n = mass_kg * rough.acceleration_m_per_s2.mean(axis=1) - force_n.mean(axis=1)
+    apart_n = mass_kg * rough.measured_m_per_s2 - force_n.mean(axis=1)
     spread_n = max(float(np.sqrt(np.mean(apart_n[valid] ** 2))), _LEAST_FORCE_N)
     mean_n, early_n = moments(force_n)
     x, v, slow_n = smoothed(
@@ -92,7 +93,7 @@ def motion_under(
     lost = x[following] - x - step_s * velocity.sum(axis=1)
     lost[-1] = 0.0
     position = x[:, None] + way + lost[:, None] * share[None, :]
-    return Motion(position, velocity, acceleration, rough.slow)
+    return Motion(position, velocity, acceleration, rough.slow, rough.measured_m_per_s2)
 
 
 def delayed(command: np.ndarray, latch_ratio: float, parts: int = PARTS_COUNT) -> np.ndarray:

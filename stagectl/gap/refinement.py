@@ -57,9 +57,9 @@ class Refiner:
             free = tuple(dict.fromkeys((*CATALOGUE[term.name].parameters[:1], *free)))
         shape = dict(term.shape)
         best = self._gain(term)
-        for sweep in range(_SWEEPS if len(free) > 1 or entire else 1):
+        for sweep in range(_SWEEPS):
             for name in free:
-                shape, best = self._line(term, shape, name, best, 2.0 if entire and not sweep else 0.5**sweep)
+                shape, best = self._line(term, shape, name, best, 2.0 if entire and not sweep else 0.4**sweep)
         found = _with_shape(term, shape)
         columns = self._evidence.columns_of(found)
         priors = tuple(max(abs(low), abs(high)) for low, high in found.bounds)

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 NULL_QUANTILE = 0.99
-MATERIAL_RATIO = 0.002
+MATERIAL_RATIO = 0.005
 """Share of everything gained so far that a further hypothesis must gain: below it, laws are not that exact."""
 
 SEARCH_PRICE = 2.0
@@ -91,7 +91,9 @@ def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
     scaled = normal / np.outer(scale, scale) + _JITTER * np.eye(size)
     inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
     values = inverse @ right
-    return Solution(tuple(groups), tuple(slots), values, inverse, float(right @ values))
+    # what these values do lower the squares by: near-collinear columns make the inverse coarse, and r'v too large
+    gain = float(2.0 * right @ values - values @ normal @ values)
+    return Solution(tuple(groups), tuple(slots), values, inverse, gain)
 
 
 def within_bounds(solution: Solution) -> bool:
@@ -361,7 +363,7 @@ class _Fold:
         scaled = normal / weights + _JITTER * np.eye(scale.size)
         values = np.linalg.solve(scaled, right / scale[:, None]) / scale[:, None]
         together = np.vstack([self._values - back @ values, values])
-        gain = np.einsum("ij,ij->j", right, values)
+        gain = 2.0 * np.einsum("ij,ij->j", right, values) - np.einsum("ij,ij->j", values, normal @ values)
         return gain, self._judged_gain([*self._slots, *slots], together) - self._apart
 
     def _judged_gain(self, slots: list[tuple[int, str]], values: np.ndarray) -> np.ndarray:
