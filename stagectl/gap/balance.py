@@ -311,7 +311,7 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
     known = {
         "position_m": relative_m if kind == "joint" else motion.position_m,
         "velocity_m_per_s": relative_m_per_s if kind == "joint" else motion.velocity_m_per_s,
-        "acceleration_m_per_s2": _believed_acceleration(recording, axis),
+        "acceleration_m_per_s2": motion.acceleration_m_per_s2,
         "relative_position_m": relative_m,
         "relative_velocity_m_per_s": relative_m_per_s,
         "motor_force_n": motor_n,
@@ -341,22 +341,6 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
             recording.side > 0.0, joint.right_stiffness_n_per_m, joint.left_stiffness_n_per_m
         )
     return known
-
-
-def _believed_acceleration(recording: Recording, axis: str) -> np.ndarray:
-    """Return what motors and joint make of a body.
-
-    Not what positions say: their second difference holds the noise that a column of it then explains.
-    """
-    total = recording.macro_command_n if axis == "macro" else recording.micro_command_n
-    if total is None:
-        raise KeyError(axis)
-    if recording.end is not None and recording.micro_command_n is not None and recording.side is not None:
-        joint_n = joint_force_n(recording)
-        total = (
-            total + joint_n if axis == "end" else total - joint_n - recording.reaction_ratio * recording.micro_command_n
-        )
-    return total / recording.mass_kg(axis)
 
 
 def operating_point(recording: Recording, moved: Sequence[tuple[Effect, str, dict[str, float]]]) -> Recording:
@@ -453,6 +437,13 @@ def reading_error_m(
         }
         error_m = along_motion(effect, [true[name] for name in effect.quantities], parameters)
     return error_m
+
+
+def moved_m(recording: Recording, effect: Effect, place: str, values: dict[str, float]) -> float:
+    """Return by how much an effect moves a reading or an edge at most, m."""
+    known = quantities(recording, "macro" if place.startswith("macro") else "end", place)
+    moved = along_motion(effect, [known[name] for name in effect.quantities], [values[n] for n in effect.parameters])
+    return float(np.max(np.abs(moved)))
 
 
 def motor_forces(recording: Recording, axis: str, force_n: np.ndarray, current_a: np.ndarray | None) -> Forces:

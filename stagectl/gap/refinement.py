@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from stagectl.effects import CATALOGUE
-from stagectl.gap import hypotheses
+from stagectl.gap import balance, hypotheses
 from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.grids import FREE_SHAPES
 from stagectl.gap.hypotheses import Term
@@ -21,7 +21,8 @@ _SWEEPS = 2
 _BRACKET = 2.2  # from the grid's place, up and down
 _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one turn over the travel
 _ANCHOR_M = 1.0
-_STEPS = (-10.0, -3.0, -1.0, -0.3, 0.3, 1.0, 3.0, 10.0)
+_STEPS = (0.3, 1.0, 3.0)
+_MOVED_M = (0.3e-6, 1e-6, 3e-6, 10e-6, 30e-6, 100e-6)
 _TOLERANCE_RATIO = 3e-3
 _WORST = 1e300
 
@@ -75,22 +76,29 @@ class Refiner:
         return self._gain(self._at_size(term))
 
     def _at_size(self, term: Term) -> Term:
-        """Take an amplitude into the shape: what the column asks for, or the best of a few steps up and down."""
+        """Take an amplitude into the shape: the best of those that move readings or edges by some micrometres.
+
+        Elsewhere, the best of a few steps about what the column asks for.
+        """
         effect = CATALOGUE[term.name]
         amplitude = effect.parameters[0]
         low, high = effect.bounds[amplitude]
-        asked = float(self._amplitudes(self._evidence.columns_of(term), term)[0])
-        value = asked if term.linear else max(asked, 0.02) * term.shape[amplitude]
         shape = {name: term.shape.get(name, 0.0) for name in effect.parameters}
-        steps = _STEPS if low < 0.0 else _STEPS[len(_STEPS) // 2 :]
+        if term.acts_on.endswith(("_sensor", "contact_edge")):
+            unit = 1e-3 * high
+            moved_m = max(
+                balance.moved_m(r, effect, term.acts_on, shape | {amplitude: unit}) for r in self._evidence.recordings
+            )
+            sizes = [sign * size_m * unit / max(moved_m, 1e-300) for size_m in _MOVED_M for sign in (1.0, -1.0)]
+        else:
+            asked = float(self._amplitudes(self._evidence.columns_of(term), term)[0])
+            sizes = [step * max(asked, 0.02) * term.shape[amplitude] for step in _STEPS]
         trials = [
-            hypotheses.term_at_size(effect, term.acts_on, shape | {amplitude: step * value})
-            for step in steps
-            if low <= step * value <= high
+            hypotheses.term_at_size(effect, term.acts_on, shape | {amplitude: size})
+            for size in sizes
+            if low <= size <= high
         ]
-        return max(
-            trials, key=self._gain, default=hypotheses.term_at_size(effect, term.acts_on, shape | {amplitude: value})
-        )
+        return max(trials, key=self._gain)
 
     def _line(
         self, term: Term, shape: dict[str, float], name: str, best: float, narrow: float

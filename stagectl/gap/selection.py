@@ -190,7 +190,7 @@ class Judge:
 
     def calibrate(self) -> None:
         """Set the threshold: the quantile of the best gain of the whole library on noise."""
-        fold = _Fold(self.base, self.source.sums, self.source.sums, on_noise=True)
+        fold = Fold(self.base, self.source.sums, self.source.sums, on_noise=True)
         best = np.zeros(self.source.sums[0].nulls.shape[0])
         for group in self.library:
             best = np.maximum(best, fold.added(group)[0])
@@ -204,8 +204,13 @@ class Judge:
         apart = sum(s.gram[0, 0] - s.count for s in held) - gain[1]
         return max(left, 0.0), max(apart, 0.0)
 
-    def select(self, start: Sequence[Group] = (), most: int = 6) -> list[Group]:
-        """Add the best hypothesis as long as one stays; then let every one compete again beside the others."""
+    def select(
+        self, start: Sequence[Group] = (), most: int = 6, until: Callable[[Group], bool] = lambda group: False
+    ) -> list[Group]:
+        """Add the best hypothesis as long as one stays; then let every one compete again beside the others.
+
+        Ends early with a hypothesis of which `until` says that everything has to be looked at anew.
+        """
         chosen = list(start)
         seen: set[frozenset[object]] = set()
         while len(chosen) < most:
@@ -217,7 +222,7 @@ class Judge:
             chosen = [*chosen, self._simplest(chosen, passing)]
             chosen = self._without_superfluous(self._competed(chosen))
             state = frozenset(group.key for group in chosen)
-            if state in seen:  # what was added is taken back again
+            if state in seen or any(until(group) for group in chosen):
                 break
             seen.add(state)
         return chosen
@@ -231,7 +236,7 @@ class Judge:
 
     def _ranked(self, chosen: Sequence[Group], most: int) -> list[Group]:
         """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
-        fold = _Fold([*self.base, *chosen], self.source.sums, self.source.sums, on_noise=False)
+        fold = Fold([*self.base, *chosen], self.source.sums, self.source.sums, on_noise=False)
         best: dict[object, tuple[float, Group]] = {}
         taken = {group.key for group in chosen}
         at_size = self.gain_at_size([*self.base, *chosen])
@@ -334,7 +339,7 @@ class Judge:
         return sorted(margins.items(), key=lambda row: row[1])
 
 
-class _Fold:
+class Fold:
     """Groups solved on some recordings and judged on others, ready to say what one more group would gain."""
 
     def __init__(self, groups: Sequence[Group], fitted: Sequence[Sums], judged: Sequence[Sums], on_noise: bool):

@@ -26,7 +26,8 @@ from stagectl.gap.selection import Group, Judge, Solution, Sums, solve
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
 _CURVE_SHARE = 0.03
-_EDGE_PASSES = 2
+_EDGE_PASSES = 3
+_EDGE_SDS = 2.0
 _DEVIATION_SD = 0.5  # of the size of an effect that is part of the operating point, a ratio
 _EXCITED_GAIN = 1e-6
 
@@ -78,6 +79,10 @@ class Findings:
     trace: tuple[str, ...] = field(default=())
 
 
+Moved = tuple[Effect, str, dict[str, float]]
+"""An effect that moves the joint's geometry or the readings, its place, its parameters."""
+
+
 def find(
     believed: Believed,
     training: Sequence[Log],
@@ -98,21 +103,22 @@ def find(
     say("reading the motion")
     recordings = [balance.recording_of(log, believed) for log in logs]
     noise = noise_of(recordings)
-    recordings = _edges_settled(recordings, noise)
+    unsettled = recordings
+    recordings, _ = _settled(unsettled, noise)
     first = Competition(recordings, len(training), nulls_count=nulls_count, seed=seed, without=without, noise=noise)
     judge = first.judge
     say(f"{len(judge.library)} hypotheses of {len({g.key for g in judge.library})} names on {len(logs)} recordings")
     judge.calibrate()
     say("effects compete")
     before = judge.reducible([])
-    chosen = judge.select()
+    chosen = judge.select(until=lambda group: _moves_joint(first, group))
     last, named = first, _all_named(first, chosen)
     moving = [group for group in chosen if _moves_joint(first, group)]
     if moving:
         say("once more, at the place where the joint is now known to be")
         moved = tuple(_moved(first, chosen, group) for group in moving)
         kept = tuple(first.term(group) for group in chosen if group not in moving)
-        there = _edges_settled([balance.operating_point(r, moved) for r in recordings], noise)
+        there, moved = _settled(unsettled, noise, moved)
         last = Competition(there, len(training), seed=seed, without=without, moved=moved, kept=kept, noise=noise)
         last.judge.threshold = judge.threshold
         last.judge.trace = judge.trace
@@ -143,33 +149,55 @@ def find(
     )
 
 
-def _edges_settled(recordings: list[Recording], noise: dict[str, Noise]) -> list[Recording]:
-    """Put the joint's edges where the recordings have them, within what is stated.
+def _settled(
+    recordings: list[Recording], noise: dict[str, Noise], moved: tuple[Moved, ...] = ()
+) -> tuple[list[Recording], tuple[Moved, ...]]:
+    """Put the joint's edges, and effects that move it, where the recordings have them; returns both as they are then.
 
     What an edge does is known to first order only: half a micrometre of error left 30 squares of the noise, which an
-    edge that moves at its size then explained in machines without any fault.
+    edge that moves at its size then explained in machines without any fault. An edge goes no further than is stated.
     """
     if not any(r.side is not None and bool(np.any(r.side)) for r in recordings):
-        return recordings
+        return recordings, moved
+    out_m = {"left": 0.0, "right": 0.0}
+    there = recordings
     for _ in range(_EDGE_PASSES):
-        for recording in recordings:
+        there = [balance.with_edges_moved(r, out_m["left"], out_m["right"]) for r in recordings]
+        there = [balance.operating_point(r, moved) for r in there] if moved else there
+        for recording in there:
             balance.set_noise(recording, noise)
-        evidence = Evidence(recordings)
-        parameters = hypotheses.parameter_terms(recordings[0])
+        evidence = Evidence(there)
+        parameters = hypotheses.parameter_terms(there[0])
         base = [Group(t.key, evidence.add(t), t.scope, (sd,), t.bounds) for t, sd in parameters]
+        for one in moved:
+            term = hypotheses.deviation_term(*one)
+            base.append(Group(term.key, evidence.add(term), term.scope, (_DEVIATION_SD,), term.bounds))
         evidence.finish(np.array([sd for _, sd in parameters]), 0, 0)
         solution = solve(base, evidence.sums)
-        edges = {term.name: (group, sd) for (term, sd), group in zip(parameters, base, strict=True)}
-        out_m = {}
-        for side in ("left", "right"):
-            group, sd = edges[f"{side}_m"]
-            out_m[side] = float(np.clip(solution.of(group)[0][0], -sd, sd))
-        recordings = [balance.with_edges_moved(r, out_m["left"], out_m["right"]) for r in recordings]
-    return recordings
+        moved = tuple(
+            _changed(one, float(solution.of(group)[0][0]))
+            for one, group in zip(moved, base[len(parameters) :], strict=True)
+        )
+        for (term, sd), group in zip(parameters, base[: len(parameters)], strict=True):
+            side = term.name.removesuffix("_m")
+            if side in out_m:
+                out_m[side] = float(np.clip(out_m[side] + solution.of(group)[0][0], -_EDGE_SDS * sd, _EDGE_SDS * sd))
+        if not moved and max(abs(out) for out in out_m.values()) >= _EDGE_SDS * believed_edge_sd(there[0]):
+            return recordings, moved  # something else pulls at them
+    there = [balance.with_edges_moved(r, out_m["left"], out_m["right"]) for r in recordings]
+    return [balance.operating_point(r, moved) for r in there] if moved else there, moved
 
 
-Moved = tuple[Effect, str, dict[str, float]]
-"""An effect that moves the joint's geometry or the readings, its place, its parameters."""
+def believed_edge_sd(recording: Recording) -> float:
+    """Return how well an edge is believed to be known, m."""
+    joint = recording.believed.joint
+    return np.inf if joint is None else joint.width_sd_m
+
+
+def _changed(moved: Moved, ratio: float) -> Moved:
+    effect, place, values = moved
+    first = effect.parameters[0]
+    return effect, place, {**values, first: values[first] * (1.0 + float(np.clip(ratio, -_DEVIATION_SD, 1.0)))}
 
 
 class Competition:
