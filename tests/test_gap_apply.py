@@ -368,4 +368,5 @@ def test_what_was_found_and_applied_is_not_found_again(tmp_path):
     believed = load_believed(file)
     assert believed.effects[1]["level_n"] == pytest.approx(1.0, rel=0.03)
     assert believed.effects[0]["damping_n_s_per_m"] == pytest.approx(30.0, rel=0.05)
-    assert find(believed, logs[:1], logs[1:], nulls_count=20).named == ()
+    again = find(believed, logs[:1], logs[1:], nulls_count=20)
+    assert again.named == (), again.trace

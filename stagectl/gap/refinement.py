@@ -6,6 +6,7 @@ edge that moves by more than the stage touches) are searched in all their parame
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -15,12 +16,13 @@ from stagectl.gap import balance, hypotheses
 from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.grids import FREE_SHAPES
 from stagectl.gap.hypotheses import Term
-from stagectl.gap.selection import Group, Sums, active_slots, covers, normal_of
+from stagectl.gap.selection import LATE_READINGS, Group, Sums, active_slots, covers, normal_of
 
 _SWEEPS = 2
 _BRACKET = 2.2  # from the grid's place, up and down
 _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one turn over the travel
 _ANCHOR_M = 1.0
+_LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)
 _MOVED_M = (0.3e-6, 1e-6, 3e-6, 10e-6, 30e-6, 100e-6)
 _TOLERANCE_RATIO = 3e-3
@@ -62,6 +64,10 @@ class Refiner:
             for name in free:
                 shape, best = self._line(term, shape, name, best, 2.0 if entire and not sweep else 0.4**sweep)
         found = _with_shape(term, shape)
+        if found.name in LATE_READINGS and not found.linear:  # what a latch may be off by is no effect of a sensor
+            stated_s = _LATCH_SDS * self._evidence.recordings[0].belief(_axis(found)).latch_sd_s
+            least = stated_s / shape[CATALOGUE[found.name].parameters[0]]
+            found = replace(found, bounds=((max(found.bounds[0][0], least), found.bounds[0][1]),))
         columns = self._evidence.columns_of(found)
         priors = tuple(max(abs(low), abs(high)) for low, high in found.bounds)
         searched = max(group.searched, len(free) - (0 if found.linear else 1))

@@ -154,6 +154,9 @@ class Judge:
     refine: Refine
     gain_at_size: Callable[[Sequence[Group]], Callable[[Group], float]]
     threshold: float = 0.0
+    modelled: float = (
+        0.0  # what laws of the model explain already that are known to be inexact, in squares of the noise
+    )
     trace: list[str] = field(default_factory=list)
     _known_rivals: dict[frozenset[tuple[int, ...]], list[Group]] = field(default_factory=dict)
 
@@ -301,7 +304,7 @@ class Judge:
         now, gains = self.gains(chosen), self.gains([*chosen, group])
         trained, apart = gains[0] - now[0], gains[1] - now[1]
         whole = self.gain([*chosen, group])
-        least = MATERIAL_RATIO * (whole - self.gain([]))
+        least = MATERIAL_RATIO * (whole - self.gain([]) + self.modelled)
         gained = whole - self.gain(chosen)
         return (
             trained > 0.0

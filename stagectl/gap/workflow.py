@@ -251,6 +251,18 @@ class Competition:
             lambda beside: Refiner(evidence, beside).gain_at_size,
         )
 
+        self.judge.modelled = self._modelled()
+
+    def _modelled(self) -> float:
+        """Return what dry friction of the model explains: a law with a step is never as exact as the noise is small."""
+        dry = {
+            f"{row['name']} on {row['acts_on']}"
+            for row in self.evidence.recordings[0].believed.effects
+            if "smoothing_m_per_s" in CATALOGUE[row["name"]].parameters
+        }
+        columns = [g.columns[0] for (t, _), g in zip(self.parameters, self.judge.base, strict=False) if t.name in dry]
+        return float(sum(s.gram[c, c] for s in self.evidence.sums for c in columns))
+
     def _taken(self, term: Term, sds: tuple[float, ...] | None = None) -> Group:
         """Take a hypothesis in; without `sds` its amplitudes may be as large as its effect can be."""
         known = sds is not None
