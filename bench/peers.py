@@ -266,7 +266,7 @@ class Outcome:
 def _findings(named: tuple[Named, ...], verdict: str) -> Findings:
     verdict = verdict or ("found" if named else "nothing")
     nothing = (0.0, 0.0)
-    return Findings("", (), (), verdict, named, (), {}, (), None, nothing, nothing, nothing)
+    return Findings("", (), (), verdict, named, (), {}, (), None, nothing, nothing, 0.0)
 
 
 def run_tool(tool: Tool, case: Case, problem: Problem) -> Outcome:

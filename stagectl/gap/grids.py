@@ -4,6 +4,7 @@ Pure.
 """
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -43,7 +44,7 @@ FREE_SHAPES: dict[str, tuple[str, ...]] = {
 Grid = dict[str, list[dict[str, float]]]
 
 
-def grids_for(recordings: list[Recording]) -> Grid:
+def grids_for(recordings: Sequence[Recording]) -> Grid:
     """Return, by effect, the shapes to try on these recordings."""
     centre_m = float(np.mean([0.5 * (r.log.macro_position_m.max() + r.log.macro_position_m.min()) for r in recordings]))
     smooth = [{"smoothing_m_per_s": v} for v in _SMOOTHINGS_M_PER_S]

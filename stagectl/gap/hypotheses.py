@@ -193,7 +193,7 @@ def _rate(r: Recording) -> np.ndarray:
     return r.end.velocity_m_per_s - r.macro.velocity_m_per_s
 
 
-def effect_terms(recordings: list[Recording], grids: dict[str, list[dict[str, float]]]) -> Iterator[Term]:
+def effect_terms(recordings: Sequence[Recording], grids: dict[str, list[dict[str, float]]]) -> Iterator[Term]:
     """Yield every effect of the catalogue at every place and shape of its grid."""
     has_micro = all(r.end is not None for r in recordings)
     present = {(row["name"], row["acts_on"]) for row in recordings[0].believed.effects}
@@ -336,7 +336,7 @@ _LEAST_CURVE_N = 1.0  # as large as what drives, or so much: free, curves and kn
 _CURVES = ("position_m", "velocity_m_per_s", "t_s")  # not acceleration: its line is a mass, and shrinks any rest
 
 
-def curve_terms(recordings: list[Recording]) -> Iterator[Term]:
+def curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
     """Yield tables over one quantity of each body: what stands for an effect that no library has."""
     axes = recordings[0].axes
     for axis in axes:
