@@ -221,7 +221,6 @@ def test_what_belongs_to_a_homing_or_a_run_is_tagged():
         "base_vibration": {"phase_rad": "run"},
         "backlash_centre_shift": {"shift_m": "session"},
         "cyclic_error": {"first_phase_rad": "session", "second_phase_rad": "session"},
-        "thermal_drift": {"drift_m": "run"},
         "abbe_error": {"centre_m": "session"},
     }
 

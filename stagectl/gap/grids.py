@@ -41,6 +41,12 @@ FREE_SHAPES: dict[str, tuple[str, ...]] = {
 }
 """Shapes that are searched beyond the grid, by effect."""
 
+
+def free_shapes(known: Effect) -> tuple[str, ...]:
+    """Return the shape parameters of an effect that are searched beyond the grid; all, where it is the user's own."""
+    return tuple(shape_of(known)) if known.origin else FREE_SHAPES.get(known.name, ())
+
+
 Grid = dict[str, list[dict[str, float]]]
 
 

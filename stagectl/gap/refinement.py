@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.evidence import Columns, Evidence
-from stagectl.gap.grids import FREE_SHAPES
+from stagectl.gap.grids import free_shapes
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.selection import LATE_READINGS, Group, Sums, active_slots, covers, normal_of
 
@@ -22,6 +22,7 @@ _SWEEPS = 2
 _BRACKET = 2.2  # from the grid's place, up and down
 _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one turn over the travel
 _ANCHOR_M = 1.0
+_NEAR_ZERO = 0.05
 _LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)
 _MOVED_M = (0.3e-6, 1e-6, 3e-6, 10e-6, 30e-6, 100e-6)
@@ -51,7 +52,9 @@ class Refiner:
     def refined(self, group: Group) -> Group:
         """Return the group at its best shape, as new columns; the same group where nothing is to be searched."""
         term = self._evidence.terms[group.columns[0]]
-        free = FREE_SHAPES.get(term.name, ())
+        if term.acts_on == "parameter":
+            return group
+        free = free_shapes(CATALOGUE[term.name])
         entire = whole_of(term)
         if not free and not entire:
             return group
@@ -124,7 +127,8 @@ class Refiner:
             low, high = max(low, at - _ANCHOR_M), min(high, at + _ANCHOR_M)
         else:
             factor = _BRACKET**narrow
-            ends = sorted((at / factor, at * factor))
+            reach = narrow * _NEAR_ZERO * (high - low)  # of a shape that may be zero, factors lead nowhere
+            ends = sorted((at / factor, at * factor)) if abs(at) > reach or low >= 0.0 else (at - reach, at + reach)
             low, high = max(low, ends[0]), min(high, ends[1])
         if not high > low:
             return shape, best

@@ -15,7 +15,7 @@ from stagectl.gap import balance, hypotheses, seeds
 from stagectl.gap.balance import Recording
 from stagectl.gap.believed import Believed
 from stagectl.gap.evidence import Evidence
-from stagectl.gap.grids import FREE_SHAPES, grids_for
+from stagectl.gap.grids import free_shapes, grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
@@ -268,7 +268,9 @@ class Competition:
         known = sds is not None
         sds = sds if sds is not None else _widest(term)
         self._sds += sds
-        searched = 0 if known else max(len(FREE_SHAPES.get(term.name, ())) - (0 if term.linear else 1), 0)
+        searched = 0
+        if not known and term.name in CATALOGUE:
+            searched = max(len(free_shapes(CATALOGUE[term.name])) - (0 if term.linear else 1), 0)
         return Group(term.key, self.evidence.add(term), term.scope, sds, term.bounds, searched)
 
     def term(self, group: Group) -> Term:
