@@ -99,5 +99,5 @@ def backlash_centre_shift(contact_side_ratio, shift_m):
     reference="Archard, J. Appl. Phys. 24, 1953, at constant load and motion: depth grows with time",
 )
 def backlash_wear(t_s, rate_m_per_s):
-    """Gap that grows: each edge lies w t / 2 further out, t since the start of the run."""
+    """Gap that grows: each edge lies w t / 2 further out, t since the machine was switched on."""
     return 0.5 * rate_m_per_s * t_s
