@@ -198,6 +198,17 @@ def last_finished(all_segments: list[Segment]) -> list[Segment]:
     return list(kept.values())
 
 
+def times_s(cycles: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return rising times of rows, s from the first: rows of one cycle share its period.
+
+    A servo that a host held up may run twice within one period of the sensor, and both rows carry its number.
+    """
+    cycles = cycles - cycles[0]
+    _, first, counts = np.unique(cycles, return_index=True, return_counts=True)
+    share = (np.arange(cycles.size) - np.repeat(first, counts)) / np.repeat(counts, counts)
+    return (cycles + share) / rate_hz
+
+
 def score_motion(run: Run, segment: Segment, truth: dict[str, np.ndarray] | None) -> MotionScore:
     """Score one motion along a trajectory."""
     profile = profile_of(run)
@@ -205,7 +216,7 @@ def score_motion(run: Run, segment: Segment, truth: dict[str, np.ndarray] | None
     rows = run.rows[segment.first_row : segment.first_row + segment.rows_count]
     skipped = _lead_in(rows, profile.cycle.rate_hz)
     rows = rows[skipped:]
-    t_s = (rows["cycle"] - rows["cycle"][0]) / profile.cycle.rate_hz
+    t_s = times_s(rows["cycle"], profile.cycle.rate_hz)
     fresh = (rows["sequence"] == rows["cycle"]) & (rows["samples_new"] > 0)
     measured_m = np.where(fresh, rows["end_position_m"] - rows["setpoint_position_m"], np.nan)
     setpoints = np.zeros(rows.size, SETPOINT)
@@ -243,7 +254,7 @@ def _joined(run: Run, truth: dict[str, np.ndarray], segment: Segment) -> Scored:
     reference_mean_m = 0.5 * (setpoint_m + before_m) + (before - speed) / (12.0 * rate_hz)
     return Scored(
         rows=rows,
-        t_s=(rows["cycle"] - rows["cycle"][0]) / rate_hz,
+        t_s=times_s(rows["cycle"], rate_hz),
         true_error_m=truth["end_position_m"][part] - setpoint_m,
         true_mean_error_m=truth["end_mean_position_m"][part] - reference_mean_m,
         measured_error_m=rows["end_position_m"] - setpoint_m,
@@ -311,7 +322,7 @@ def score_backlash(run: Run, truth: dict[str, np.ndarray] | None) -> BacklashSco
         segment=segment,
         edges=_edges(identified, true),
         rows=rows,
-        t_s=(rows["cycle"] - rows["cycle"][0]) / float(run.manifest["profile"]["cycle"]["rate_hz"]),
+        t_s=times_s(rows["cycle"], float(run.manifest["profile"]["cycle"]["rate_hz"])),
     )
 
 
