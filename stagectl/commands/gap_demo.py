@@ -176,6 +176,11 @@ def _numbers(first: Outcome, before_m: float, after_m: float) -> Table:
 
 def _page(names: str, hidden: dict, first: Outcome, before_m: float, after_m: float) -> Report:
     rows: Sequence = _rows(first, before_m, after_m)
-    table = report.Table("The loop closed", ("", "before", "after"), rows, "gap on the move that confirmed it, rms")
+    table = report.Table(
+        "The loop closed",
+        ("", "before", "after"),
+        rows,
+        "gap: force left along the found effect on the move that confirmed it, rms",
+    )
     banner = "Recorded over the wire with the software rig in virtual time; one effect was hidden from the profile."
     return Report("stagectl gap demo", banner, (table,), facts=(("hidden", _secret(hidden)[8:]), ("found", names)))

@@ -34,11 +34,8 @@ class Noise:
 
 
 @compiled
-def gains(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, white_force_n, loose_force_n):
-    """Return (gains (n, 4), innovation variances (n,)); `loose` intervals feel an unknown force of `loose_force_n`."""
-    n = valid.size
-    gain = np.zeros((n, _STATES))
-    variance = np.zeros(n)
+def _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
+    """Return (transition, driving covariance of the slow force, covariance before the first sample), (4, 4) each."""
     h = period_s
     turn = corner_rad_per_s * h
     decay = np.exp(-turn)
@@ -57,6 +54,17 @@ def gains(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, 
     p = steady.copy()
     p[0, 0] = _START_SD[0] ** 2 + sensor_m * sensor_m
     p[1, 1] = _START_SD[1] ** 2
+    return a, drive, p
+
+
+@compiled
+def gains(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, white_force_n, loose_force_n):
+    """Return (gains (n, 4), innovation variances (n,)); `loose` intervals feel an unknown force of `loose_force_n`."""
+    n = valid.size
+    gain = np.zeros((n, _STATES))
+    variance = np.zeros(n)
+    h = period_s
+    a, drive, p = _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)
     half = np.zeros((_STATES, _STATES))
     for k in range(n):
         variance[k] = p[0, 0] + sensor_m * sensor_m
@@ -123,23 +131,7 @@ def smoothed(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, fo
     """
     n = position_m.size
     h = period_s
-    turn = corner_rad_per_s * h
-    decay = np.exp(-turn)
-    a = np.zeros((_STATES, _STATES))
-    a[0] = np.array([1.0, h, 0.5 * h * h / mass_kg, 0.0])
-    a[1] = np.array([0.0, 1.0, h / mass_kg, 0.0])
-    a[2] = np.array([0.0, 0.0, decay, decay * turn])
-    a[3] = np.array([0.0, 0.0, 0.0, decay])
-    steady = np.zeros((_STATES, _STATES))
-    steady[2, 2] = force_n * force_n
-    steady[2, 3] = steady[3, 2] = steady[2, 2]
-    steady[3, 3] = 2.0 * steady[2, 2]
-    moved = a @ steady @ a.T
-    drive = np.zeros((_STATES, _STATES))
-    drive[2:, 2:] = steady[2:, 2:] - moved[2:, 2:]
-    p = steady.copy()
-    p[0, 0] = _START_SD[0] ** 2 + sensor_m * sensor_m
-    p[1, 1] = _START_SD[1] ** 2
+    a, drive, p = _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)
     before, spread, gain = np.zeros((n, _STATES)), np.zeros((n, _STATES, _STATES)), np.zeros((n, _STATES))
     share, z = np.zeros(n), np.zeros(n)  # of innovations: one over their variance, 0 where nothing was measured
     x = np.zeros(_STATES)

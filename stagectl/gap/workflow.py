@@ -182,13 +182,13 @@ def _settled(
             side = term.name.removesuffix("_m")
             if side in out_m:
                 out_m[side] = float(np.clip(out_m[side] + solution.of(group)[0][0], -_EDGE_SDS * sd, _EDGE_SDS * sd))
-        if not moved and max(abs(out) for out in out_m.values()) >= _EDGE_SDS * believed_edge_sd(there[0]):
+        if not moved and max(abs(out) for out in out_m.values()) >= _EDGE_SDS * _edge_sd_m(there[0]):
             return recordings, moved  # something else pulls at them
     there = [balance.with_edges_moved(r, out_m["left"], out_m["right"]) for r in recordings]
     return [balance.operating_point(r, moved) for r in there] if moved else there, moved
 
 
-def believed_edge_sd(recording: Recording) -> float:
+def _edge_sd_m(recording: Recording) -> float:
     """Return how well an edge is believed to be known, m."""
     joint = recording.believed.joint
     return np.inf if joint is None else joint.width_sd_m
