@@ -16,9 +16,10 @@ CHUNK_LIMIT_BYTES = 512
 """Sensor bytes of one cycle, what one row can hold; the rest comes with the next cycle."""
 
 _BUS_OFF = 0x40  # linux/can/error.h
-_SPIN_NS = 150_000
+_SPIN_NS = 200_000
 """The last stretch before a cycle is awaited awake: the line comes in it, and waking up takes 60 us (p50) to 110 us
-(p90) on an ordinary kernel. From the instant due to SYNC written it is 116 us with 80 us of it, 67 us with 150 us."""
+(p90) on an ordinary kernel. From the instant due to SYNC written it is 116 us with 80 us of it, 67 us with 150 us; the
+other 50 us are for the rehearsal."""
 
 
 def error_frame_text(can_id: int) -> str:
@@ -57,11 +58,21 @@ class RealtimeTransport:
         """Return the host clock."""
         return now_t_ns()
 
-    def await_bytes(self, deadline_t_ns: int, inbox: Inbox) -> bool:
-        """Wait until the deadline, or until the cycle's first sensor bytes are stamped and in the inbox."""
+    def sleep(self, deadline_t_ns: int, inbox: Inbox) -> bool:
+        """Sleep until the last stretch; bytes that come meanwhile are stamped and in the inbox."""
         if self._kept and not inbox.sensor_bytes:
             inbox.add_sensor_bytes(self._kept, inbox.sensor_arrival_t_ns)
             self._kept = b""
+        while (left_ns := deadline_t_ns - now_t_ns()) > _SPIN_NS:
+            wait_s = (left_ns - _SPIN_NS) * 1e-9
+            if self._kept or not self._readable:  # what is kept already fills the next row
+                time.sleep(wait_s)
+            elif self._line_within(wait_s):
+                self._read(inbox)
+        return left_ns > 0
+
+    def await_bytes(self, deadline_t_ns: int, inbox: Inbox) -> bool:
+        """Wait until the deadline, or until the cycle's first sensor bytes are stamped and in the inbox."""
         while not inbox.sensor_bytes and self._wait(deadline_t_ns, inbox):
             pass
         return bool(inbox.sensor_bytes)
@@ -77,19 +88,13 @@ class RealtimeTransport:
         return now_t_ns()
 
     def _wait(self, deadline_t_ns: int, inbox: Inbox) -> bool:
-        """Wait for sensor bytes, for the last stretch before the deadline, or for the deadline; False at the last."""
-        left_ns = deadline_t_ns - now_t_ns()
-        if left_ns <= 0:
+        """Look for sensor bytes once, at the first time for frames too; False when the deadline is there."""
+        if deadline_t_ns <= now_t_ns():
             return False
-        if left_ns <= _SPIN_NS:
-            if not self._polled:
-                self._look(inbox)
-                self._polled = True
-            elif not self._kept and self._line_within(0.0):  # what is kept already fills the next row
-                self._read(inbox)
-        elif self._kept or not self._readable:
-            time.sleep((left_ns - _SPIN_NS) * 1e-9)
-        elif self._line_within((left_ns - _SPIN_NS) * 1e-9):
+        if not self._polled:
+            self._look(inbox)
+            self._polled = True
+        elif not self._kept and self._line_within(0.0):
             self._read(inbox)
         return True
 

@@ -134,6 +134,10 @@ class BatchTransport:
         """Return virtual time."""
         return self._wire.t_ns
 
+    def sleep(self, deadline_t_ns: int, inbox: Inbox) -> bool:
+        """Nobody waits in virtual time, and no cache cools down."""
+        return False
+
     def await_bytes(self, deadline_t_ns: int, inbox: Inbox) -> bool:
         """Tell nothing before the deadline: in virtual time decoding early gains nothing."""
         return False

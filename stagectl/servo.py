@@ -16,6 +16,7 @@ from drivers.wire import HEARTBEAT_FRAME, SYNC_FRAME, Inbox, WireDecoder, WireEn
 from stagectl.fields import fields
 from stagectl.guard import NEGATIVE_LIMIT, POSITIVE_LIMIT, PRESSURE_LOW, SAFE_TORQUE_OFF
 from stagectl.laws.reference import gap_centre
+from stagectl.rehearsal import Rehearsal
 from stagectl.requests import STATUS, TEXT_BYTES_COUNT, TICKING, Mode, Phase
 from stagectl.ring import RequestReader, RequestWriter, RingWriter
 from stagectl.row import FRAME_BYTES_COUNT, ROW, new_rows
@@ -82,6 +83,10 @@ class Transport(Protocol):
         """Return the time of this world's clock."""
         ...
 
+    def sleep(self, deadline_t_ns: int, inbox: Inbox) -> bool:
+        """Sleep until shortly before the deadline, stamping what comes; tell whether there is time for a rehearsal."""
+        ...
+
     def await_bytes(self, deadline_t_ns: int, inbox: Inbox) -> bool:
         """Wait until the deadline, or until the cycle's first sensor bytes are in the inbox; tell whether they are."""
         ...
@@ -115,6 +120,7 @@ class Servo:
         self.decoder, self.encoder, self.tracker, self.transport = decoder, encoder, tracker, transport
         self.segments, self.requests, self.status, self.ring = segments, requests, status, ring
         self._clock_ns = clock_ns
+        self._rehearsal = Rehearsal(profile, decoder, encoder)
         self.inbox = Inbox()
         self.row = new_rows(1)
         self._row_bytes = _bytes_of(self.row)
@@ -189,6 +195,9 @@ class Servo:
         inbox.clear()
         if self._rows == 0:  # what passed since the servo was made is nobody's lateness
             self._deadline_t_ns = self.transport.now_t_ns() + self._period_ns
+        if self.transport.sleep(self._deadline_t_ns, inbox):
+            self._rehearsal.step()
+            self.requests.read()  # heeded when the cycle's own bytes are in
         if self.transport.await_bytes(self._deadline_t_ns, inbox):
             self.decoder.take_bytes(inbox)
         self._take_request()
@@ -249,6 +258,7 @@ class Servo:
         if stop is not Stop.NONE:
             self._brake(stop, guided, t_ns)
         self._publish()
+        self._rehearsal.keep(inbox)
         self._plan_next()
 
     def _decode(self, t_ns: int) -> None:

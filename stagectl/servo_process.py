@@ -66,7 +66,7 @@ def make_real_time(cpu: int | None) -> list[str]:
     return refused
 
 
-class _Rehearsal:
+class _Nowhere:
     """A transport without a world, to run every line of a cycle once before the real one starts."""
 
     lost_count = 0
@@ -78,6 +78,10 @@ class _Rehearsal:
     def now_t_ns(self) -> int:
         """Return a time that only cycles move."""
         return self._t_ns
+
+    def sleep(self, deadline_t_ns: int, inbox: Inbox) -> bool:
+        """Let the cycle be rehearsed, at once."""
+        return True
 
     def await_bytes(self, deadline_t_ns: int, inbox: Inbox) -> bool:
         """Nothing comes."""
@@ -126,7 +130,7 @@ def _warm(profile: Profile) -> None:
     RingWriter(None, slots_count=2)
 
 
-def _rehearse(profile: Profile, mappings: dict, segments: np.ndarray) -> None:
+def _run_nowhere(profile: Profile, mappings: dict, segments: np.ndarray) -> None:
     """Run a servo on nothing for some cycles: first calls of anything cost milliseconds."""
     requests, status = RequestWriter(None, REQUEST), RequestWriter(None, STATUS)
     servo = Servo(
@@ -134,7 +138,7 @@ def _rehearse(profile: Profile, mappings: dict, segments: np.ndarray) -> None:
         WireDecoder(profile, mappings),
         WireEncoder(profile, mappings),
         Tracker(profile, has_drives=True),
-        _Rehearsal(),
+        _Nowhere(),
         segments,
         requests.reader(),
         status,
@@ -149,7 +153,7 @@ def _serve(config: dict[str, Any]) -> int:
     profile = profile_from_effective(config["profile"], "the supervisor's profile")  # a drive may have been capped
     mappings = {axis: mapping_of(table) for axis, table in config["mappings"].items()}
     segments = np.memmap(config["segments"], dtype=SETPOINT, mode="r")
-    _rehearse(profile, mappings, segments)  # before the port is open: its buffer would fill with old lines
+    _run_nowhere(profile, mappings, segments)  # before the port is open: its buffer would fill with old lines
     names = frame_names(mappings)
     bus = open_cyclic(config["interface"], config["channel"], list(names))
     port = SerialPort(config["port"], config["baud_bit_per_s"])

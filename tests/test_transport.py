@@ -34,7 +34,9 @@ class World:
     def cycle(self) -> Inbox:
         """Receive for a few milliseconds."""
         inbox = Inbox()
-        self.transport.receive(self.transport.now_t_ns() + 3 * MS, inbox)
+        due_t_ns = self.transport.now_t_ns() + 3 * MS
+        self.transport.sleep(due_t_ns, inbox)
+        self.transport.receive(due_t_ns, inbox)
         return inbox
 
     def unplug(self) -> None:
