@@ -273,16 +273,20 @@ class WireDecoder:
             if powered or code >> 8 not in _SILENCE_CODES:
                 seen.emergency = mapping.node_id << 16 | code if code else 0
 
-    def take_bytes(self, inbox: Inbox) -> None:
-        """Decode the sensor bytes that are there and were not taken yet.
+    def take_first_bytes(self, inbox: Inbox) -> None:
+        """Decode what the first read of the cycle gave, where that was not taken yet.
 
-        A servo calls it as soon as the first of a cycle are in, so that SYNC does not wait for it (50 us in real
-        time, its caches cold); `decode` takes the rest. When it is called changes nothing of what comes out.
+        A servo calls it as soon as they are in, so that SYNC does not wait for it (50 us in real time, its caches cold);
+        `decode` takes the rest. When it is called changes nothing of what comes out.
         """
         first = inbox.first_bytes_count
         if self._taken_bytes_count == 0 < first:
             self._taken_bytes_count = first
             self._feed(inbox.sensor_bytes[:first], inbox.first_arrival_t_ns)
+
+    def _take_bytes(self, inbox: Inbox) -> None:
+        """Decode all that was not taken yet; what came with later reads has one arrival, that of the last."""
+        self.take_first_bytes(inbox)
         if self._taken_bytes_count < len(inbox.sensor_bytes):
             rest = inbox.sensor_bytes[self._taken_bytes_count :]
             self._taken_bytes_count = len(inbox.sensor_bytes)
@@ -305,7 +309,7 @@ class WireDecoder:
         be what was agreed, else an empty text.
         """
         text = ""
-        self.take_bytes(inbox)
+        self._take_bytes(inbox)
         valid = self._valid_count
         self._taken_bytes_count = self._valid_count = 0
         try:

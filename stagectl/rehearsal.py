@@ -38,7 +38,6 @@ class Rehearsal:
 
     def step(self) -> None:
         """Decode what is kept, and encode frames that go nowhere."""
-        self._decoder.take_bytes(self._inbox)
         self._decoder.decode(self._inbox, self._seen)
         self._seen.store()
         self._encoder.micro(ENABLE_OPERATION, 0)

@@ -199,7 +199,7 @@ class Servo:
             self._rehearsal.step()
             self.requests.read()  # heeded when the cycle's own bytes are in
         if self.transport.await_bytes(self._deadline_t_ns, inbox):
-            self.decoder.take_bytes(inbox)
+            self.decoder.take_first_bytes(inbox)
         self._take_request()
         t_ns = self.transport.receive(self._deadline_t_ns, inbox)
         lateness_ns = t_ns - self._deadline_t_ns

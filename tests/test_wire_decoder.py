@@ -16,20 +16,20 @@ MS = 1_000_000
 
 
 def _measurements(name: str, taken_early: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Listen for 0.6 s, two lines a cycle, each taken at once or both at its end; measurements and clock."""
+    """Listen for 0.6 s, three lines a cycle, each offered at once or all at its end; measurements and clock."""
     wire = BatchWire(Rig(load_machine(name), seed=3))
     decoder = WireDecoder(load_profile(name), {})
     measured, inbox = new(MEASUREMENT), Inbox()
     seen = fields(measured)
-    rows = np.zeros(300, MEASUREMENT)
+    rows = np.zeros(200, MEASUREMENT)
     for number in range(rows.size):
         inbox.clear()
-        due_t_ns = wire.t_ns + 2 * MS
+        due_t_ns = wire.t_ns + 3 * MS
         while (line_t_ns := wire.next_line_t_ns()) <= due_t_ns:
             wire.advance_to(line_t_ns)
             inbox.add_sensor_bytes(wire.serial.read(), wire.serial.arrival_t_ns)
             if taken_early:
-                decoder.take_bytes(inbox)
+                decoder.take_first_bytes(inbox)
         wire.advance_to(due_t_ns)
         inbox.t_ns = wire.t_ns
         assert decoder.decode(inbox, seen) == ""
