@@ -276,8 +276,8 @@ class WireDecoder:
     def take_first_bytes(self, inbox: Inbox) -> None:
         """Decode what the first read of the cycle gave, where that was not taken yet.
 
-        A servo calls it as soon as they are in, so that SYNC does not wait for it (50 us in real time, its caches cold);
-        `decode` takes the rest. When it is called changes nothing of what comes out.
+        A servo calls it as soon as they are in, so that SYNC does not wait for that; `decode` takes the rest.
+        When it is called changes nothing of what comes out.
         """
         first = inbox.first_bytes_count
         if self._taken_bytes_count == 0 < first:
