@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from stagectl.gap.workflow import Findings, Named, ParameterError
+from stagectl.gap.findings import Findings, Named, ParameterError
 
 Key = tuple[str, str]
 """Name and place."""

@@ -8,8 +8,9 @@ from bench.figure import Bar, Figure, absent, judged
 from stagectl.errors import StagectlError
 from stagectl.gap import addition, arbiter
 from stagectl.gap.believed import Believed
+from stagectl.gap.findings import Findings, Named
 from stagectl.gap.log import Log
-from stagectl.gap.workflow import Findings, Named, find
+from stagectl.gap.workflow import find
 
 RIGHT = Bar("EMPS: Coulomb, offset, asymmetric viscous friction, 2.5 mm force: named", "of 4", 4.0, at_least=True)
 WRONG = Bar("EMPS: names of what it lacks", "names", 0.0)

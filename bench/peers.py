@@ -32,9 +32,10 @@ from stagectl.effects import CATALOGUE
 from stagectl.errors import StagectlError
 from stagectl.gap import addition, arbiter
 from stagectl.gap.believed import Believed
+from stagectl.gap.findings import Findings, Named
 from stagectl.gap.hypotheses import Term, phase_of
 from stagectl.gap.log import Log
-from stagectl.gap.workflow import Findings, Named, find
+from stagectl.gap.workflow import find
 from tests.blind import score
 
 SINGLE_SEEDS, NULL_SEEDS, OUTSIDE_SEEDS = range(8001, 8200), range(8201, 8300), range(8301, 8400)

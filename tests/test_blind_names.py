@@ -8,7 +8,7 @@ import pytest
 from bench import blind_names
 from bench.blind_names import PARAMETERS, TRANSLATIONS, UNMAPPED, in_words_of_the_truth, our_keys, truth_key
 from stagectl.effects import CATALOGUE
-from stagectl.gap.workflow import Findings, Named, ParameterError
+from stagectl.gap.findings import Findings, Named, ParameterError
 from tests.blind import draw, laws, machine, score
 
 RATE_S = 1e-4

@@ -4,7 +4,7 @@ import pytest
 
 from bench import emps_figures
 from bench.emps_figures import right_names, wrong_names
-from stagectl.gap.workflow import Findings, Named
+from stagectl.gap.findings import Findings, Named
 
 
 def named(name, aliases=(), **parameters):

@@ -13,8 +13,9 @@ from stagectl.effects import CATALOGUE
 from stagectl.errors import ProfileError, RecordError, RequestError
 from stagectl.gap.application import application, applied
 from stagectl.gap.believed import document_of, load_believed
+from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.findings_file import read_findings, write_findings
-from stagectl.gap.workflow import Findings, Named, ParameterError, find
+from stagectl.gap.workflow import find
 from stagectl.profile import PROFILES_FOLDER
 from tests.test_gap_parts import _axis_log
 

@@ -14,10 +14,10 @@ from stagectl.commands.opening import home_and_arm
 from stagectl.errors import RequestError
 from stagectl.gap import moves, next_move, prediction
 from stagectl.gap.believed import load_believed
+from stagectl.gap.findings import Findings, Named
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import log_of_rows, read_log
 from stagectl.gap.planned import planned_log
-from stagectl.gap.workflow import Findings, Named
 from stagectl.profile import load_profile
 from stagectl.record import read_run
 from stagectl.stage import open_stage

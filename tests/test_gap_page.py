@@ -10,9 +10,9 @@ import pytest
 from stagectl import cli
 from stagectl.gap import balance, findings_figures, findings_page, residual
 from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.findings_file import read_findings
 from stagectl.gap.log import Log
-from stagectl.gap.workflow import Findings, Named, ParameterError
 from stagectl.table_import import import_table
 from tests.gap_tables import AXIS_MAP, MASS_KG, H, axis_table, profile_file, write_csv
 

@@ -11,7 +11,8 @@ from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.innovations import moments
 from stagectl.gap.log import Log, log_of_rows
-from stagectl.gap.selection import Fold, Group, Judge, Sums, solve
+from stagectl.gap.normal_equations import Fold, Group, Sums, solve
+from stagectl.gap.selection import Judge
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
 

@@ -10,7 +10,7 @@ from bench import peers
 from bench.blind_sets import load_set
 from bench.peers import TOOLS, Case, Outcome, Tally, row, run_tool, stepwise, table
 from bench.regression import problem_of
-from stagectl.gap.workflow import Named
+from stagectl.gap.findings import Named
 from tests.blind import draw, generate, laws
 from tests.blind.machine import B
 

@@ -16,9 +16,10 @@ from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import addition, arbiter, findings_page, plausibility, residual
 from stagectl.gap.application import Application, Change, application
 from stagectl.gap.believed import Believed, document_of, load_believed
+from stagectl.gap.findings import Findings, Named
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import Log, read_log
-from stagectl.gap.workflow import Findings, Named, find
+from stagectl.gap.workflow import find
 from stagectl.profile import Profile, search_folders
 from stagectl.whole_file import replace_whole
 

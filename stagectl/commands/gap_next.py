@@ -16,13 +16,13 @@ from stagectl.commands.runs import folder_of
 from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import moves, next_move, prediction
 from stagectl.gap.believed import Believed, load_believed
+from stagectl.gap.findings import Findings
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import Log, log_of_rows, read_log
 from stagectl.gap.moves import Move
 from stagectl.gap.next_move import Proposal
 from stagectl.gap.prediction import Evidence, Expected, Outcome, with_outcomes
 from stagectl.gap.prediction_file import OUTCOME, PREDICTION, write_outcome, write_prediction
-from stagectl.gap.workflow import Findings
 from stagectl.profile import Profile, load_profile
 from stagectl.record import read_manifest, read_run
 from stagectl.supervisor import Supervisor

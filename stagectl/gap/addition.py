@@ -9,7 +9,7 @@ from typing import Any
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap.believed import Believed
-from stagectl.gap.workflow import Findings, Named
+from stagectl.gap.findings import Findings, Named
 
 _OF_A_PLACE = re.compile(r"(\w+) of (session|run) (.*)", re.DOTALL)
 

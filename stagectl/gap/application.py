@@ -20,8 +20,8 @@ from stagectl.effects import CATALOGUE
 from stagectl.effects.table import KNOTS_COUNT, TABLES
 from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import addition
+from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.hypotheses import phase_of
-from stagectl.gap.workflow import Findings, Named, ParameterError
 
 _SIGMAS = 1.96  # of a 95 % interval
 _LEAST_RATIO = 1e-3  # effects of the profile that were refitted by less stay as they are

@@ -13,6 +13,7 @@ from stagectl import compose
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap import innovations
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
+from stagectl.gap.contact import Contact, contact_at, contact_damping_n_s_per_m, side_stiffness_n_per_m
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
 from stagectl.gap.motion import PARTS_COUNT, Motion, delayed, driven, lagged, lagged_at_samples, motion_of, motion_under
@@ -23,6 +24,9 @@ AXES = ("macro", "end")
 _SETTLE_S = 0.3  # the filter forgets how it began
 _LOOSE_N = 1e3
 _READING_PASSES = 2
+
+Moved = tuple[Effect, str, dict[str, float]]
+"""An effect that moves the joint's geometry or the readings, its place, its parameters."""
 
 
 @dataclass(slots=True)
@@ -133,7 +137,9 @@ def _recording(log: Log, believed: Believed, macro: Motion, end: Motion | None) 
             log.micro_command_n, believed.micro.latch_s, believed.micro.current_loop_s, h
         )
         if believed.joint is not None:
-            side, depth, depth_rate = _contact(believed, believed.joint, macro, end)
+            x_b, x_b_rate = _relative(macro, end)
+            contact = contact_at(believed, believed.joint, x_b, x_b_rate)
+            side, depth, depth_rate = contact.side, contact.depth_m, contact.depth_rate_m_per_s
     else:
         end = None
     recording = Recording(log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {})
@@ -142,20 +148,6 @@ def _recording(log: Log, believed: Believed, macro: Motion, end: Motion | None) 
             believed_a = at_samples_n[axis] / recording.belief(axis).force_constant_n_per_a
             recording.reported_a[axis] = reported_a - believed_a
     return recording
-
-
-def _contact(
-    believed: Believed, joint: BelievedJoint, macro: Motion, end: Motion
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (side, penetration, its rate) on parts of intervals; a contact whose damping would pull has let go."""
-    x_b = macro.position_m - end.position_m
-    side = np.where(x_b > joint.right_m, 1.0, np.where(x_b < -joint.left_m, -1.0, 0.0))
-    depth = np.where(side > 0.0, x_b - joint.right_m, np.where(side < 0.0, -joint.left_m - x_b, 0.0))
-    rate = side * (macro.velocity_m_per_s - end.velocity_m_per_s)
-    damping = sum(row["damping_n_s_per_m"] for row in believed.effects if row["name"] == "contact_damping")
-    stiffness = np.where(side > 0.0, joint.right_stiffness_n_per_m, joint.left_stiffness_n_per_m)
-    touches = stiffness * depth + damping * rate > 0.0
-    return side * touches, depth * touches, rate * touches
 
 
 def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = True) -> None:
@@ -258,15 +250,25 @@ def known_forces(recording: Recording) -> Forces:
 
 
 def joint_force_n(recording: Recording) -> np.ndarray:
-    """Force of spring, damping and contact on the end, shape (n, parts)."""
+    """Force of spring, damping and contact on the end, shape (n, parts); damping of the contact is an effect."""
     joint, end = recording.believed.joint, recording.end
-    if joint is None or end is None or recording.side is None or recording.penetration_m is None:
+    if joint is None or end is None:
         raise KeyError("joint")
-    relative_m = end.position_m - recording.macro.position_m
-    rate = end.velocity_m_per_s - recording.macro.velocity_m_per_s
-    stiffness = np.where(recording.side > 0.0, joint.right_stiffness_n_per_m, joint.left_stiffness_n_per_m)
-    contact_n = recording.side * stiffness * recording.penetration_m
-    return contact_n - joint.spring_n_per_m * relative_m - joint.damping_n_s_per_m * rate
+    x_b, x_b_rate = _relative(recording.macro, end)
+    contact_n = _contact_of(recording).push_n(joint, 0.0)
+    return contact_n + joint.spring_n_per_m * x_b + joint.damping_n_s_per_m * x_b_rate
+
+
+def _contact_of(recording: Recording) -> Contact:
+    side, depth_m, rate = recording.side, recording.penetration_m, recording.penetration_velocity_m_per_s
+    if side is None or depth_m is None or rate is None:
+        raise KeyError("joint")
+    return Contact(side, depth_m, rate)
+
+
+def _relative(macro: Motion, end: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Return x_b = macro minus end on parts of intervals, and its rate."""
+    return macro.position_m - end.position_m, macro.velocity_m_per_s - end.velocity_m_per_s
 
 
 def add(total: Forces, more: Forces) -> None:
@@ -337,13 +339,11 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
         known["penetration_m"] = recording.penetration_m
         known["penetration_velocity_m_per_s"] = recording.penetration_velocity_m_per_s
         known["contact_side_ratio"] = recording.side
-        known["contact_stiffness_n_per_m"] = np.where(
-            recording.side > 0.0, joint.right_stiffness_n_per_m, joint.left_stiffness_n_per_m
-        )
+        known["contact_stiffness_n_per_m"] = side_stiffness_n_per_m(joint, recording.side)
     return known
 
 
-def operating_point(recording: Recording, moved: Sequence[tuple[Effect, str, dict[str, float]]]) -> Recording:
+def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
     """Return a recording with sensor errors taken out of its positions and edges where effects have put them.
 
     moved: effects that move the joint's geometry, with their places and parameters.
@@ -469,10 +469,7 @@ def _edges_moved(
     for side in (-1.0, 1.0):
         known = quantities(recording, "end", "contact_edge") | {"contact_side_ratio": np.full_like(value, side)}
         out_m[side] = along_motion(effect, [known[name] for name in effect.quantities], parameters)
-    x_b = recording.macro.position_m - end.position_m
-    rate = recording.macro.velocity_m_per_s - end.velocity_m_per_s
-    push_n = _contact_force_n(recording.believed, x_b, rate, out_m[-1.0], out_m[1.0])
-    push_n = push_n - _contact_force_n(recording.believed, x_b, rate, 0.0, 0.0)
+    push_n = _more_contact_n(recording, joint, 0.0, 0.0, out_m[-1.0], out_m[1.0])
     return Forces(macro_n=-push_n, end_n=push_n)
 
 
@@ -487,11 +484,8 @@ def _misread(recording: Recording, axis: str, error_m: np.ndarray, whole: bool) 
     if whole:
         fine_m = _between_samples(sampled_m if axis == "end" else -sampled_m, PARTS_COUNT)
         slope = np.gradient(fine_m.ravel(), recording.log.period_s / PARTS_COUNT).reshape(fine_m.shape)
-        x_b = recording.macro.position_m - end.position_m
-        rate = recording.macro.velocity_m_per_s - end.velocity_m_per_s
         spring_n = joint.spring_n_per_m * fine_m + joint.damping_n_s_per_m * slope
-        contact_n = _contact_force_n(recording.believed, x_b + fine_m, rate + slope, 0.0, 0.0)
-        forces.end_n = spring_n + contact_n - _contact_force_n(recording.believed, x_b, rate, 0.0, 0.0)
+        forces.end_n = spring_n + _more_contact_n(recording, joint, fine_m, slope)
     else:
         left = np.where(recording.side < 0.0, joint.left_stiffness_n_per_m, 0.0)
         right = np.where(recording.side > 0.0, joint.right_stiffness_n_per_m, 0.0)
@@ -507,23 +501,21 @@ def _between_samples(values: np.ndarray, parts: int) -> np.ndarray:
     return values[:, None] + share[None, :] * (following - values)[:, None]
 
 
-def _contact_force_n(
-    believed: Believed,
-    x_b: np.ndarray,
-    rate: np.ndarray,
-    left_out_m: np.ndarray | float,
-    right_out_m: np.ndarray | float,
+def _more_contact_n(
+    recording: Recording,
+    joint: BelievedJoint,
+    apart_m: np.ndarray | float,
+    apart_m_per_s: np.ndarray | float,
+    left_out_m: np.ndarray | float = 0.0,
+    right_out_m: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Force of the believed contact on the end at relative positions x_b = macro minus end, edges moved outward."""
-    joint = believed.joint
-    if joint is None:
-        return np.zeros_like(x_b)
-    damping = sum(row["damping_n_s_per_m"] for row in believed.effects if row["name"] == "contact_damping")
-    right_m = x_b - joint.right_m - right_out_m
-    left_m = -joint.left_m - left_out_m - x_b
-    right_n = np.where(right_m > 0.0, np.maximum(joint.right_stiffness_n_per_m * right_m + damping * rate, 0.0), 0.0)
-    left_n = np.where(left_m > 0.0, np.maximum(joint.left_stiffness_n_per_m * left_m - damping * rate, 0.0), 0.0)
-    return right_n - left_n
+    """Return by how much the contact pushes the end more with x_b larger by `apart_m`, and edges moved outward."""
+    if recording.end is None:
+        raise KeyError("end")
+    x_b, x_b_rate = _relative(recording.macro, recording.end)
+    damping = contact_damping_n_s_per_m(recording.believed)
+    there = contact_at(recording.believed, joint, x_b + apart_m, x_b_rate + apart_m_per_s, left_out_m, right_out_m)
+    return there.push_n(joint, damping) - _contact_of(recording).push_n(joint, damping)
 
 
 def along_motion(effect: Effect, arguments: list[np.ndarray], parameters: list[float]) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from stagectl.gap import balance
 from stagectl.gap.balance import Recording
 from stagectl.gap.hypotheses import Term
-from stagectl.gap.selection import Group, Sums
+from stagectl.gap.normal_equations import Group, Sums
 
 INNOVATIONS = 0
 """Number of the column that the others are to explain."""

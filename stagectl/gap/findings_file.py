@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stagectl.errors import RecordError
-from stagectl.gap.workflow import Findings, Named, ParameterError
+from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.whole_file import replace_whole
 
 FINDINGS = "findings.json"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from stagectl.gap import findings_figures
+from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.residual import Residual
-from stagectl.gap.workflow import Findings, Named, ParameterError
 from stagectl.report import Figure, Quantity, Report, Section, Table, rounded
 from stagectl.units import unit_of
 

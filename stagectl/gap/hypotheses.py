@@ -287,6 +287,8 @@ def _scope(effect: Effect, amplitudes: list[str]) -> str:
 
 
 _STEP_RATIO = 0.02
+DEVIATION_SD = 0.5
+"""Standard deviation of a deviation term: of the size of an effect that is part of the operating point, a ratio."""
 
 
 def deviation_term(effect: Effect, place: str, parameters: dict[str, float]) -> Term:

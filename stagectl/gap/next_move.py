@@ -12,11 +12,11 @@ import numpy as np
 from stagectl.gap import hypotheses, prediction
 from stagectl.gap.balance import channels
 from stagectl.gap.believed import Believed
+from stagectl.gap.findings import Findings
 from stagectl.gap.grids import grids_for
 from stagectl.gap.moves import Move
 from stagectl.gap.planned import planned_log
 from stagectl.gap.prediction import DETECTED, Evidence, Expected
-from stagectl.gap.workflow import Findings
 
 _LOW_SPEED = ("slow reversals", "creep")
 _STROKES = ("slow stroke", "middle stroke", "fast stroke")

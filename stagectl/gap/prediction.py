@@ -24,11 +24,11 @@ from stagectl.gap import balance, hypotheses
 from stagectl.gap.addition import parted
 from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.believed import Believed
+from stagectl.gap.findings import Findings, Named
 from stagectl.gap.grids import grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.log import Log
 from stagectl.gap.noise import noise_of
-from stagectl.gap.workflow import Findings, Named
 
 SIGMAS = 1.96
 """Of a 95 % interval."""

@@ -16,7 +16,8 @@ from stagectl.gap import balance, hypotheses
 from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.grids import free_shapes
 from stagectl.gap.hypotheses import Term
-from stagectl.gap.selection import LATE_READINGS, Group, Sums, active_slots, covers, normal_of
+from stagectl.gap.normal_equations import Group, Sums, active_slots, covers, normal_of
+from stagectl.gap.selection import LATE_READINGS
 
 _SWEEPS = 2
 _BRACKET = 2.2  # from the grid's place, up and down

@@ -20,9 +20,9 @@ from stagectl.gap import balance, hypotheses
 from stagectl.gap.arbiter import lap_samples
 from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.believed import Believed
+from stagectl.gap.findings import Findings, Named
 from stagectl.gap.log import Log
 from stagectl.gap.motion import PARTS_COUNT
-from stagectl.gap.workflow import Findings, Named
 
 NOISE_FORCE_N = 0.05
 """Rms of the sensor's noise in the residual force; the force that nobody models is about as large."""

@@ -1,0 +1,129 @@
+"""All hypotheses on recordings at one operating point: known parameters, effects, curves, ready to compete. Pure."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from stagectl.effects import CATALOGUE
+from stagectl.gap import balance, hypotheses, seeds
+from stagectl.gap.balance import Moved, Recording
+from stagectl.gap.evidence import Evidence
+from stagectl.gap.grids import free_shapes, grids_for
+from stagectl.gap.hypotheses import DEVIATION_SD, Term
+from stagectl.gap.innovations import Noise
+from stagectl.gap.normal_equations import Group, Sums
+from stagectl.gap.refinement import Refiner
+from stagectl.gap.selection import Judge
+
+_EXCITED_GAIN = 1e-6
+
+
+class Competition:
+    """All hypotheses on recordings at one operating point, ready to compete."""
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        training_count: int,
+        *,
+        nulls_count: int = 0,
+        seed: int = 0,
+        without: frozenset[str] = frozenset(),
+        moved: tuple[Moved, ...] = (),
+        kept: tuple[Term, ...] = (),
+        noise: dict[str, Noise],
+    ):
+        """Whiten, make the columns, sum. `moved` effects are part of the recordings already, `kept` terms start."""
+        for recording in recordings:
+            balance.set_noise(recording, noise)
+        self.moved = moved
+        self.evidence = evidence = Evidence(recordings)
+        self.parameters = hypotheses.parameter_terms(recordings[0])
+        self.curves: list[Group] = []
+        self.kept: list[Group] = []
+        self._sds: list[float] = []
+        base: list[Group] = []
+        library: list[Group] = []
+        for term, sd in self.parameters:
+            base.append(self._taken(term, (sd,)))
+        for effect, place, values in moved:
+            base.append(self._taken(hypotheses.deviation_term(effect, place, values), (DEVIATION_SD,)))
+        taken = {(effect.name, place) for effect, place, _ in moved}
+        grids = grids_for(recordings)
+        wrong = hypotheses.wrong_parameter_terms(recordings[0])
+
+        def searched(terms: Iterable[Term]) -> list[Group]:
+            return [self._taken(term) for term in terms if term.name not in without and term.key not in taken]
+
+        library += searched([*wrong, *hypotheses.effect_terms(recordings, grids)])
+        self.kept += [self._taken(term) for term in kept]
+        self.curves += [self._taken(term) for term in hypotheses.curve_terms(recordings)]
+        library += searched(_periodic_terms(evidence, np.array(self._sds)))
+        evidence.finish(np.array([sd for _, sd in self.parameters]), nulls_count, seed)
+        self.judge = Judge(
+            evidence,
+            training_count,
+            base,
+            library,
+            lambda beside, group: Refiner(evidence, beside).refined(group),
+            lambda beside: Refiner(evidence, beside).gain_at_size,
+        )
+
+        self.judge.modelled = self._modelled()
+
+    def _modelled(self) -> float:
+        """Return what dry friction of the model explains: a law with a step is never as exact as the noise is small."""
+        dry = {
+            f"{row['name']} on {row['acts_on']}"
+            for row in self.evidence.recordings[0].believed.effects
+            if "smoothing_m_per_s" in CATALOGUE[row["name"]].parameters
+        }
+        columns = [g.columns[0] for (t, _), g in zip(self.parameters, self.judge.base, strict=False) if t.name in dry]
+        return float(sum(s.gram[c, c] for s in self.evidence.sums for c in columns))
+
+    def _taken(self, term: Term, sds: tuple[float, ...] | None = None) -> Group:
+        """Take a hypothesis in; without `sds` its amplitudes may be as large as its effect can be."""
+        known = sds is not None
+        sds = sds if sds is not None else _widest(term)
+        self._sds += sds
+        searched = 0
+        if not known and term.name in CATALOGUE:
+            searched = max(len(free_shapes(CATALOGUE[term.name])) - (0 if term.linear else 1), 0)
+        return Group(term.key, self.evidence.add(term), term.scope, sds, term.bounds, searched)
+
+    def term(self, group: Group) -> Term:
+        """Return what a group stands for."""
+        return self.evidence.terms[group.columns[0]]
+
+    def not_excited(self) -> tuple[str, ...]:
+        """Name the effects that would not show in these recordings at any size."""
+        terms = {group.key: self.term(group) for group in self.judge.library}
+        excited = {
+            group.key
+            for group in self.judge.library
+            if any(_energy(group, s) > _EXCITED_GAIN * s.count for s in self.judge.training)
+        }
+        return tuple(sorted(f"{term.name} on {term.acts_on}" for key, term in terms.items() if key not in excited))
+
+
+def _periodic_terms(evidence: Evidence, prior_sds: np.ndarray) -> list[Term]:
+    """Make terms of pitches and frequencies that stand out of what all other hypotheses leave."""
+    recordings = evidence.recordings
+    found: list[Term] = []
+    for place, axis in enumerate(recordings[0].axes):
+        signals = [seeds.force_signal(r, axis, evidence.rest(k, place, prior_sds)) for k, r in enumerate(recordings)]
+        pitches = seeds.pitches_m(recordings, axis, signals)
+        frequencies = seeds.frequencies_hz(recordings, axis, signals)
+        found += hypotheses.periodic_terms(recordings, axis, pitches, frequencies)
+    return found
+
+
+def _widest(term: Term) -> tuple[float, ...]:
+    """Return how large each amplitude can be at all: the far end of what its effect is declared for."""
+    if not term.bounds:
+        return (np.inf,) * len(term.amplitudes)
+    return tuple(max(abs(low), abs(high)) for low, high in term.bounds)
+
+
+def _energy(group: Group, s: Sums) -> float:
+    return float(max(s.gram[c, c] for c in group.columns))

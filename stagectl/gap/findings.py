@@ -1,0 +1,49 @@
+"""What a set of recordings says of a machine, as values. Pure."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """One effect that the recordings show."""
+
+    name: str
+    acts_on: str
+    parameters: dict[str, float]
+    sds: dict[str, float]
+    gain: float
+    held_out_gain: float
+    aliases: tuple[tuple[str, str, float], ...]
+    confirmed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterError:
+    """A known parameter that the recordings contradict."""
+
+    name: str
+    error: float  # ratio, or metres for an edge
+    sd: float
+    stated_sd: float
+    aliases: tuple[str, ...] = ()  # parameters that would do as well
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What a set of recordings says of a machine."""
+
+    profile: str
+    runs: tuple[str, ...]
+    holdout: tuple[str, ...]
+    verdict: str  # nothing | found | unknown
+    named: tuple[Named, ...]
+    parameter_errors: tuple[ParameterError, ...]
+    refitted: dict[str, float]  # every known parameter's error as fitted: a ratio, or metres for an edge
+    not_excited: tuple[str, ...]
+    unknown: dict[str, Any] | None
+    reducible_before: tuple[float, float]
+    reducible_after: tuple[float, float]
+    threshold: float
+    remarks: tuple[str, ...] = ()
+    trace: tuple[str, ...] = field(default=())

@@ -1,0 +1,219 @@
+"""Generalised least squares on whitened columns: amplitudes and gains of groups of columns, from Gram matrices.
+
+Everything is algebra on one Gram matrix a recording, so hundreds of hypotheses and hundreds of nulls cost seconds.
+Pure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+_JITTER = 1e-10
+_BOUND_SDS = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Sums:
+    """One recording: Gram matrix of [innovations, columns...] in units of the noise, and how many numbers it sums."""
+
+    gram: np.ndarray
+    count: float
+    session: str
+    run: str
+    nulls: np.ndarray  # what the columns make of white noise in the innovations' place, shape (draws, columns)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Columns that stay or go together; `prior_sds` says how far each amplitude may be from zero, inf = any."""
+
+    key: object
+    columns: tuple[int, ...]
+    scope: str = "structural"  # structural | session | run: how far its amplitudes reach
+    prior_sds: tuple[float, ...] = ()
+    bounds: tuple[tuple[float, float], ...] = ()  # of each amplitude; a friction that drives is no friction
+    searched: int = 0  # shape parameters that a grid or a spectrum chose
+
+    @property
+    def complexity(self) -> int:
+        """Numbers that it takes from the data."""
+        return len(self.columns) + self.searched
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Amplitudes of some groups on some recordings, and what they gain over none at all."""
+
+    groups: tuple[Group, ...]
+    slots: tuple[tuple[int, str], ...]  # (column, "" or the session or run that it is of)
+    values: np.ndarray
+    covariance: np.ndarray
+    gain: float
+
+    def of(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
+        """Return values and standard deviations of one group, sessions one after the other."""
+        places = [k for k, (column, _) in enumerate(self.slots) if column in group.columns]
+        return self.values[places], np.sqrt(np.maximum(np.diag(self.covariance)[places], 0.0))
+
+
+def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
+    """Solve the amplitudes of `groups` on all of `sums`."""
+    slots, precision = active_slots(groups, sums)
+    size = len(slots)
+    normal, right = normal_of(slots, precision, sums)
+    if not size:
+        return Solution(tuple(groups), (), np.zeros(0), np.zeros((0, 0)), 0.0)
+    scale = np.sqrt(np.diag(normal))
+    scale[scale == 0.0] = 1.0  # a column that nothing excites
+    scaled = normal / np.outer(scale, scale) + _JITTER * np.eye(size)
+    inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
+    values = inverse @ right
+    # what these values do lower the squares by: near-collinear columns make the inverse coarse, and r'v too large
+    gain = float(2.0 * right @ values - values @ normal @ values)
+    return Solution(tuple(groups), tuple(slots), values, inverse, gain)
+
+
+def within_bounds(solution: Solution) -> bool:
+    """Tell whether no amplitude is outside what its effect can be, by more than twice its standard deviation."""
+    allowed = {
+        column: bounds
+        for group in solution.groups
+        if group.bounds
+        for column, bounds in zip(group.columns, group.bounds, strict=True)
+    }
+    for (column, _), value, variance in zip(solution.slots, solution.values, np.diag(solution.covariance), strict=True):
+        if column in allowed:
+            low, high = allowed[column]
+            slack = _BOUND_SDS * float(np.sqrt(max(variance, 0.0)))
+            if not low - slack <= value <= high + slack:
+                return False
+    return True
+
+
+def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
+    """Return by how much amplitudes from elsewhere lower the squares of recordings that no fit saw.
+
+    Amplitudes that belong to a session are solved there, and cost what so many free amplitudes gain on noise.
+    """
+    fixed = [k for k, (_, scope) in enumerate(solution.slots) if scope == ""]
+    own = sorted({column for column, scope in solution.slots if scope != ""})
+    total = 0.0
+    columns = [solution.slots[k][0] for k in fixed]
+    theta = solution.values[fixed]
+    for s in held:
+        total += float(2.0 * theta @ s.gram[columns, 0] - theta @ s.gram[np.ix_(columns, columns)] @ theta)
+        if own:
+            right = s.gram[own, 0] - s.gram[np.ix_(own, columns)] @ theta
+            normal = s.gram[np.ix_(own, own)]
+            normal = normal + (_JITTER * np.trace(normal) + 1e-300) * np.eye(len(own))
+            total += float(right @ np.linalg.solve(normal, right)) - len(own)
+    return total
+
+
+class Fold:
+    """Groups solved on some recordings and judged on others, ready to say what one more group would gain."""
+
+    def __init__(self, groups: Sequence[Group], fitted: Sequence[Sums], judged: Sequence[Sums], on_noise: bool):
+        self._fitted, self._judged, self._on_noise = fitted, judged, on_noise
+        self._slots, precision = active_slots(groups, fitted)
+        self._rights = {id(s): _right(s, on_noise) for s in [*fitted, *judged]}
+        normal = self._cross(self._slots, self._slots, fitted) + np.diag(precision)
+        scale = np.sqrt(np.diag(normal))
+        scale[scale == 0.0] = 1.0
+        weights = np.outer(scale, scale)
+        self._inverse = np.linalg.inv(normal / weights + _JITTER * np.eye(scale.size)) / weights
+        self._values = self._inverse @ self._seen(self._slots, fitted)
+        self._apart = self._judged_gain(self._slots, self._values)
+
+    def added(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
+        """Return (gain where it is fitted, gain where it is judged) of one group more, one element a right side."""
+        slots, precision = active_slots([group], self._fitted)
+        cross = self._cross(self._slots, slots, self._fitted)
+        back = self._inverse @ cross
+        normal = self._cross(slots, slots, self._fitted) + np.diag(precision) - cross.T @ back
+        right = self._seen(slots, self._fitted) - cross.T @ self._values
+        scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+        if not np.all(scale > 0.0):
+            return np.zeros(right.shape[1]), np.zeros(right.shape[1])
+        weights = np.outer(scale, scale)
+        scaled = normal / weights + _JITTER * np.eye(scale.size)
+        values = np.linalg.solve(scaled, right / scale[:, None]) / scale[:, None]
+        together = np.vstack([self._values - back @ values, values])
+        gain = 2.0 * np.einsum("ij,ij->j", right, values) - np.einsum("ij,ij->j", values, normal @ values)
+        return gain, self._judged_gain([*self._slots, *slots], together) - self._apart
+
+    def _judged_gain(self, slots: list[tuple[int, str]], values: np.ndarray) -> np.ndarray:
+        fixed = [k for k, (_, scope) in enumerate(slots) if scope == ""]
+        own = sorted({column for column, scope in slots if scope != ""})
+        columns, theta = [slots[k][0] for k in fixed], values[fixed]
+        total = np.zeros(values.shape[1])
+        for s in self._judged:
+            right = self._rights[id(s)]
+            bent = s.gram[np.ix_(columns, columns)] @ theta
+            total += 2.0 * np.einsum("ij,ij->j", theta, right[columns]) - np.einsum("ij,ij->j", theta, bent)
+            if own:
+                rest = right[own] - s.gram[np.ix_(own, columns)] @ theta
+                normal = s.gram[np.ix_(own, own)]
+                normal = normal + (_JITTER * np.trace(normal) + 1e-300) * np.eye(len(own))
+                total += np.einsum("ij,ij->j", rest, np.linalg.solve(normal, rest)) - len(own)
+        return total
+
+    def _seen(self, slots: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
+        total = np.zeros((len(slots), self._rights[id(sums[0])].shape[1]))
+        for s in sums:
+            here = [k for k, (_, scope) in enumerate(slots) if covers(scope, s)]
+            total[here] += self._rights[id(s)][[slots[k][0] for k in here]]
+        return total
+
+    @staticmethod
+    def _cross(a: list[tuple[int, str]], b: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
+        total = np.zeros((len(a), len(b)))
+        for s in sums:
+            rows = [k for k, (_, scope) in enumerate(a) if covers(scope, s)]
+            columns = [k for k, (_, scope) in enumerate(b) if covers(scope, s)]
+            part = s.gram[np.ix_([a[k][0] for k in rows], [b[k][0] for k in columns])]
+            total[np.ix_(rows, columns)] += part
+        return total
+
+
+def covers(scope: str, s: Sums) -> bool:
+    """Tell whether an amplitude of a scope reaches a recording."""
+    return scope in ("", f"session {s.session}", f"run {s.run}")
+
+
+def _right(s: Sums, on_noise: bool) -> np.ndarray:
+    """Return what the columns see, row 0 the innovations' own square, shape (1 + columns, right sides)."""
+    if not on_noise:
+        return s.gram[:, :1]
+    return np.vstack([np.full(s.nulls.shape[0], s.count), s.nulls.T])
+
+
+def normal_of(
+    slots: Sequence[tuple[int, str]], precision: Sequence[float], sums: Sequence[Sums]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal matrix, priors included, and the right side of some amplitudes."""
+    normal, right = np.diag(np.array(precision, float)), np.zeros(len(slots))
+    for s in sums:
+        here = [k for k, (_, scope) in enumerate(slots) if covers(scope, s)]
+        columns = [slots[k][0] for k in here]
+        normal[np.ix_(here, here)] += s.gram[np.ix_(columns, columns)]
+        right[here] += s.gram[columns, 0]
+    return normal, right
+
+
+def active_slots(groups: Sequence[Group], sums: Sequence[Sums]) -> tuple[list[tuple[int, str]], list[float]]:
+    """Return (column, scope) of every amplitude of some groups, and how well each is known beforehand."""
+    scopes = {
+        "structural": ("",),
+        "session": tuple(sorted({f"session {s.session}" for s in sums})),
+        "run": tuple(sorted({f"run {s.run}" for s in sums})),
+    }
+    slots: list[tuple[int, str]] = []
+    precision: list[float] = []
+    for group in groups:
+        for scope in scopes[group.scope]:
+            for number, column in enumerate(group.columns):
+                slots.append((column, scope))
+                precision.append(group.prior_sds[number] ** -2 if group.prior_sds else 0.0)
+    return slots, precision
