@@ -129,7 +129,7 @@ def test_one_elimination_gives_what_solving_anew_gives():
 
 
 def _axis_log(name: str, friction_n: float, seed: int) -> Log:
-    """An axis under a spring-like controller of its own, with dry friction that nobody is told of; semi-implicit."""
+    """An axis under a spring-like controller of its own, with dry friction that nobody is told of."""
     random = np.random.default_rng(seed)
     n, parts = 8000, 20
     t = np.arange(n) * H
@@ -141,8 +141,9 @@ def _axis_log(name: str, friction_n: float, seed: int) -> Log:
         seen[k] = x + 5e-9 * random.standard_normal()
         command[k] = 4.0e4 * (reference[k] - seen[k]) + 2.5e3 * (speed[k] - v)
         for _ in range(parts):
+            x += 0.5 * v * H / parts
             v += (command[k] - friction_n * np.tanh(v / 1e-4) - 30.0 * v + slow[k]) / MASS * H / parts
-            x += v * H / parts
+            x += 0.5 * v * H / parts
     return Log(name, H, seen, command, np.ones(n, bool), "1", reference_m=reference)
 
 

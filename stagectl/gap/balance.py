@@ -13,10 +13,11 @@ from stagectl import compose
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap import innovations
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
+from stagectl.gap.command_path import PARTS_COUNT, changed_by, delayed, driven
 from stagectl.gap.contact import Contact, contact_at, contact_damping_n_s_per_m, side_stiffness_n_per_m
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
-from stagectl.gap.motion import PARTS_COUNT, Motion, delayed, driven, lagged, lagged_at_samples, motion_of, motion_under
+from stagectl.gap.motion import Motion, motion_of, motion_under
 
 AXES = ("macro", "end")
 """Bodies; the second one is the micro's, its position the end's."""
@@ -109,11 +110,11 @@ class Recording:
 def recording_of(log: Log, believed: Believed) -> Recording:
     """Prepare a log: motion, commands on parts of intervals, contact geometry."""
     rough = _recording(log, believed, motion_of(log.macro_position_m, log.period_s, believed.macro.noise_m), None)
-    return smoothed_under(rough, known_forces(rough))
+    return foretold_under(rough, known_forces(rough))
 
 
-def smoothed_under(recording: Recording, forces: Forces) -> Recording:
-    """Return a recording whose motion is smoothed once more, under the forces that are now thought to act."""
+def foretold_under(recording: Recording, forces: Forces) -> Recording:
+    """Return a recording with the motion that follows from its past and from the forces that are thought to act."""
     log, believed = recording.log, recording.believed
     motions: list[Motion | None] = [None, None]
     for k, (axis, force_n) in enumerate(zip(AXES, (forces.macro_n, forces.end_n), strict=True)):
@@ -200,6 +201,12 @@ def observed(recording: Recording) -> list[np.ndarray]:
     return parts + [_scaled(recording, axis, reported_a) for axis, reported_a in recording.reported_a.items()]
 
 
+def unexplained(recording: Recording, forces: Forces) -> list[np.ndarray]:
+    """Return the innovations of all channels under what is believed and under more forces."""
+    columns = column(recording, forces)
+    return [z if part is None else z - part for z, part in zip(observed(recording), columns, strict=True)]
+
+
 def column(recording: Recording, forces: Forces) -> list[np.ndarray | None]:
     """Return what forces and errors that the filter knows nothing of add to the innovations, by channel; None is 0."""
     parts: list[np.ndarray | None] = []
@@ -280,6 +287,11 @@ def add(total: Forces, more: Forces) -> None:
             setattr(total, name, extra if held is None else held + extra)
 
 
+def sum_of(forces: Forces, more: Forces) -> Forces:
+    """Return forces and forces together."""
+    return scaled(more, 1.0, forces)
+
+
 def scaled(forces: Forces, factor: float, more: Forces) -> Forces:
     """Return `factor` times some forces, added to others."""
     total = replace(more)
@@ -328,8 +340,9 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
     }
     if kind == "sensor":  # a reading is of the sample's instant: one column, where all else has parts of intervals
         known = {name: _at_samples(values) for name, values in known.items()}
+        for place, name in enumerate(("position_m", "velocity_m_per_s", "acceleration_m_per_s2")):
+            known[name] = motion.at_samples[:, place : place + 1]
         known |= {
-            "position_m": recording.position_m(axis)[:, None],
             "t_s": (recording.log.start_s + recording.log.times_s)[:, None],
             "dt_s": np.full((recording.log.samples_count, 1), h),
         }
@@ -343,31 +356,44 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
     return known
 
 
+_CORRECTIONS = 2
+
+
 def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
     """Return a recording with sensor errors taken out of its positions and edges where effects have put them.
 
-    moved: effects that move the joint's geometry, with their places and parameters.
+    moved: effects that move the joint's geometry, with their places and parameters. What a sensor adds is taken along
+    the readings at first, then along the motion that is left without it.
     """
-    log, believed = recording.log, recording.believed
+    raw, believed = recording.log, recording.believed
+    there = recording
     for effect, place, values in moved:
-        parameters = [values[name] for name in effect.parameters]
-        axis = "macro" if place.startswith("macro") else "end"
-        known = quantities(recording, axis, place)
-        if place.endswith("_sensor"):
-            error_m = reading_error_m(recording, effect, place, parameters, True)[:, 0]
-            if axis == "macro":
-                log = replace(log, macro_position_m=log.macro_position_m - error_m)
-            else:
-                log = replace(log, end_position_m=recording.position_m("end") - error_m)
-        elif believed.joint is not None:
+        if not place.endswith("_sensor") and believed.joint is not None:
+            known = quantities(recording, "end", place)
             out_m = {}
             for side in (-1.0, 1.0):
                 sided = known | {"contact_side_ratio": np.full_like(known["contact_side_ratio"], side)}
                 out_m[side] = float(
-                    np.mean(along_motion(effect, [sided[name] for name in effect.quantities], parameters))
+                    np.mean(
+                        along_motion(effect, [sided[name] for name in effect.quantities], _in_order(effect, values))
+                    )
                 )
             believed = _edges_out(believed, out_m[-1.0], out_m[1.0])
-    return recording_of(log, believed)
+    for number in range(_CORRECTIONS if any(place.endswith("_sensor") for _, place, _ in moved) else 1):
+        log = raw
+        for effect, place, values in moved:
+            if place == "macro_sensor":
+                error_m = reading_error_m(there, effect, place, _in_order(effect, values), number == 0)[:, 0]
+                log = replace(log, macro_position_m=log.macro_position_m - error_m)
+            elif place == "end_sensor" and log.end_position_m is not None:
+                error_m = reading_error_m(there, effect, place, _in_order(effect, values), number == 0)[:, 0]
+                log = replace(log, end_position_m=log.end_position_m - error_m)
+        there = recording_of(log, believed)
+    return there
+
+
+def _in_order(effect: Effect, values: dict[str, float]) -> list[float]:
+    return [values[name] for name in effect.parameters]
 
 
 def with_edges_moved(recording: Recording, left_out_m: float, right_out_m: float) -> Recording:
@@ -400,23 +426,30 @@ def effect_forces(
     known = quantities(recording, axis, place)
     if place.endswith("_sensor"):
         return _misread(recording, axis, reading_error_m(recording, effect, place, parameters, whole), whole)
+    if place.endswith("_command"):
+        return _commanded(recording, axis, effect, parameters)
     value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
     if place in ("contact", "joint"):
         push_n = value if place == "joint" else recording.side * value if recording.side is not None else 0.0 * value
         return Forces(macro_n=-push_n, end_n=push_n)
     if place == "contact_edge":
         return _edges_moved(recording, effect, parameters, value, whole)
-    if place.endswith("_command"):
-        belief = recording.belief(axis)
-        return motor_forces(
-            recording,
-            axis,
-            lagged(value * belief.force_constant_n_per_a, belief.current_loop_s, recording.log.period_s),
-            lagged_at_samples(value, belief.current_loop_s, recording.log.period_s),
-        )
     if place.endswith("_actuator"):
         return motor_forces(recording, axis, value, None)
     return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
+
+
+def _commanded(recording: Recording, axis: str, effect: Effect, parameters: list[float]) -> Forces:
+    """Return what an effect of the command path changes of one motor's force and reported current."""
+    command_n = recording.log.macro_command_n if axis == "macro" else recording.log.micro_command_n
+    if command_n is None:
+        return Forces()
+    belief = recording.belief(axis)
+    command_a = command_n / belief.force_constant_n_per_a
+    added_a, at_a = changed_by(
+        effect, parameters, command_a, belief.latch_s, belief.current_loop_s, recording.log.period_s
+    )
+    return motor_forces(recording, axis, added_a * belief.force_constant_n_per_a, at_a)
 
 
 def reading_error_m(

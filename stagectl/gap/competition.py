@@ -6,12 +6,13 @@ import numpy as np
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses, seeds
-from stagectl.gap.balance import Moved, Recording
+from stagectl.gap.balance import Forces, Moved, Recording
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.grids import free_shapes, grids_for
 from stagectl.gap.hypotheses import DEVIATION_SD, Term
 from stagectl.gap.innovations import Noise
-from stagectl.gap.normal_equations import Group, Sums
+from stagectl.gap.noise import Explained
+from stagectl.gap.normal_equations import Group, Sums, solve
 from stagectl.gap.refinement import Refiner
 from stagectl.gap.selection import Judge
 
@@ -89,11 +90,39 @@ class Competition:
         searched = 0
         if not known and term.name in CATALOGUE:
             searched = max(len(free_shapes(CATALOGUE[term.name])) - (0 if term.linear else 1), 0)
-        return Group(term.key, self.evidence.add(term), term.scope, sds, term.bounds, searched)
+        return Group(
+            term.key,
+            self.evidence.add(term),
+            term.scope,
+            sds,
+            term.bounds,
+            searched,
+            self.evidence.places_count(term.scope),
+        )
 
     def term(self, group: Group) -> Term:
         """Return what a group stands for."""
         return self.evidence.terms[group.columns[0]]
+
+    def explained(self, chosen: Sequence[Group]) -> Explained:
+        """Return what known parameters and `chosen` effects add in a recording, at the sizes that all recordings give."""
+        solution = solve([*self.judge.base, *chosen], self.evidence.sums)
+        values = {
+            (column, scope): float(value)
+            for (column, scope), value in zip(solution.slots, solution.values, strict=True)
+        }
+        terms = [(self.term(group), group) for group in (*self.judge.base[: len(self.parameters)], *chosen)]
+
+        def of(recording: Recording) -> Forces:
+            scopes = ("", f"session {recording.log.session}", f"run {recording.log.name}")
+            total = Forces()
+            for term, group in terms:
+                for column, forces in zip(group.columns, term.forces(recording), strict=True):
+                    value = next((values[column, scope] for scope in scopes if (column, scope) in values), 0.0)
+                    total = balance.scaled(forces, value, total)
+            return total
+
+        return of
 
     def not_excited(self) -> tuple[str, ...]:
         """Name the effects that would not show in these recordings at any size."""

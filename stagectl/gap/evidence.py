@@ -56,6 +56,11 @@ class Evidence:
             observed = balance.observed(recording)
             self.channels.append([Channel(name, [INNOVATIONS], [z]) for name, z in zip(names, observed, strict=True)])
 
+    def places_count(self, scope: str) -> int:
+        """Return how many amplitudes of its own a term of this scope has for each of its columns."""
+        logs = [recording.log for recording in self.recordings]
+        return {"session": len({log.session for log in logs}), "run": len(logs)}.get(scope, 1)
+
     def columns_of(self, term: Term) -> Columns:
         """Return the columns of a term in units of the noise."""
         found: Columns = []
@@ -145,7 +150,7 @@ class Evidence:
             s = self.sums[k]
             nulls = np.hstack([s.nulls, np.zeros((s.nulls.shape[0], len(numbers)))])
             self.sums[k] = replace(s, gram=np.block([[s.gram, cross], [cross.T, own]]), nulls=nulls)
-        return Group(term.key, numbers, term.scope, prior_sds, term.bounds, searched)
+        return Group(term.key, numbers, term.scope, prior_sds, term.bounds, searched, self.places_count(term.scope))
 
 
 def _stacked(parts: list[np.ndarray | None], scale: float) -> np.ndarray | None:

@@ -12,7 +12,7 @@ import numpy as np
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap import balance
 from stagectl.gap.balance import Forces, Recording
-from stagectl.gap.motion import driven
+from stagectl.gap.command_path import driven
 
 
 @dataclass(frozen=True, slots=True)

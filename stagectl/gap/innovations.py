@@ -124,41 +124,33 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
 
 
 @compiled
-def smoothed(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
-    """Return (position, velocity, slow force) at the samples as forward and backward passes see them, (n,) each.
-
-    The smoother of the filter above after Bierman (Factorization Methods, 1977, X.3): no covariance is inverted.
-    """
+def filtered(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
+    """Return what the filter knows of (position, velocity, slow force) with each sample, what it foretold of (position,
+    velocity) before it, shapes (n, 3) and (n, 2), and minus twice the log-likelihood of the samples."""
     n = position_m.size
     h = period_s
     a, drive, p = _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)
-    before, spread, gain = np.zeros((n, _STATES)), np.zeros((n, _STATES, _STATES)), np.zeros((n, _STATES))
-    share, z = np.zeros(n), np.zeros(n)  # of innovations: one over their variance, 0 where nothing was measured
+    known, foretold = np.zeros((n, 3)), np.zeros((n, 2))
+    unlikely = 0.0
     x = np.zeros(_STATES)
     x[0] = position_m[0]
     pull = np.zeros(_STATES)
     for k in range(n):
-        before[k] = x
-        spread[k] = p
+        foretold[k] = x[:2]
         if valid[k]:
-            share[k] = 1.0 / (p[0, 0] + sensor_m * sensor_m)
-            gain[k] = p[:, 0] * share[k]
-            z[k] = position_m[k] - x[0]
-            x = x + gain[k] * z[k]
-            p = p - np.outer(gain[k], p[0])
+            variance = p[0, 0] + sensor_m * sensor_m
+            z = position_m[k] - x[0]
+            unlikely += z * z / variance + np.log(variance)
+            gain = p[:, 0] / variance
+            x = x + gain * z
+            p = p - np.outer(gain, p[0])
+        known[k] = x[:3]
         pull[0] = 0.5 * h * h * early_n[k] / mass_kg
         pull[1] = h * mean_n[k] / mass_kg
         x = a @ x + pull
         p = a @ p @ a.T + drive
         p = 0.5 * (p + p.T)
-    out = np.zeros((n, _STATES))
-    pending = np.zeros(_STATES)  # what later samples say of the state after this one
-    for i in range(n):
-        k = n - 1 - i
-        pending[0] -= share[k] * z[k] + gain[k] @ pending
-        out[k] = before[k] - spread[k] @ pending
-        pending = a.T @ pending
-    return out[:, 0].copy(), out[:, 1].copy(), out[:, 2].copy()
+    return known, foretold, unlikely
 
 
 def moments(fine_n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

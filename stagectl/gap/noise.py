@@ -5,24 +5,25 @@ much there is is what makes them white. Bursts, a friction that turns around, ar
 all counts. Pure.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from stagectl.gap import balance
-from stagectl.gap.balance import Recording
+from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.believed import Believed
 from stagectl.gap.innovations import Noise
-
-SLOW_FORCE_N = 0.05
-SLOW_CORNER_RAD_PER_S = 2.0 * np.pi * 1.34
-"""The force that nobody models, where a profile says nothing of it: 0.05 N rms below 2 Hz, falling with the square."""
+from stagectl.gap.motion import SLOW_CORNER_RAD_PER_S, SLOW_FORCE_N
 
 _FORCES_N = (0.0, *(1e-3 * 2.0**k for k in range(14)))
 _STRETCH = 512
 _LOW, _HIGH = (0.06, 0.2), (0.3, 0.5)  # shares of the sample rate
 _WHITE_RATIO = 1.08
+
+
+Explained = Callable[[Recording], Forces]
+"""What is thought to act in a recording beyond what is believed."""
 
 
 def slow_noise(believed: Believed, recording: Recording) -> dict[str, Noise]:
@@ -33,14 +34,18 @@ def slow_noise(believed: Believed, recording: Recording) -> dict[str, Noise]:
     return noise
 
 
-def noise_of(recordings: Sequence[Recording]) -> dict[str, Noise]:
-    """Return slow force, force noise and sensor noise of each body, the force noise from all recordings together."""
+def noise_of(recordings: Sequence[Recording], explained: Explained | None = None) -> dict[str, Noise]:
+    """Return slow force, force noise and sensor noise of each body, the force noise from all recordings together.
+
+    explained: what is thought to act beyond what is believed; unexplained friction looks like force noise.
+    """
+    forces = [Forces() if explained is None else explained(recording) for recording in recordings]
     noise = slow_noise(recordings[0].believed, recordings[0])
     for axis, level in noise.items():
         low, high = 0, len(_FORCES_N) - 1
         while low < high:  # the ratio falls with the force noise that the filter expects
             middle = (low + high) // 2
-            if _redness(recordings, axis, replace(level, white_force_n=_FORCES_N[middle])) <= _WHITE_RATIO:
+            if _redness(recordings, forces, axis, replace(level, white_force_n=_FORCES_N[middle])) <= _WHITE_RATIO:
                 high = middle
             else:
                 low = middle + 1
@@ -48,12 +53,12 @@ def noise_of(recordings: Sequence[Recording]) -> dict[str, Noise]:
     return noise
 
 
-def _redness(recordings: Sequence[Recording], axis: str, level: Noise) -> float:
+def _redness(recordings: Sequence[Recording], forces: Sequence[Forces], axis: str, level: Noise) -> float:
     """Return the innovations' power at middle over that at high frequencies, in the middle one of all stretches."""
     ratios = []
-    for recording in recordings:
+    for recording, more in zip(recordings, forces, strict=True):
         balance.set_noise(recording, {name: level for name in recording.axes})
-        z = balance.observed(recording)[recording.axes.index(axis)]
+        z = balance.unexplained(recording, more)[recording.axes.index(axis)]
         count = z.size // _STRETCH
         if not count:
             continue

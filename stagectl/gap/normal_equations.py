@@ -34,11 +34,12 @@ class Group:
     prior_sds: tuple[float, ...] = ()
     bounds: tuple[tuple[float, float], ...] = ()  # of each amplitude; a friction that drives is no friction
     searched: int = 0  # shape parameters that a grid or a spectrum chose
+    places_count: int = 1  # sessions or runs that have amplitudes of their own
 
     @property
     def complexity(self) -> int:
         """Numbers that it takes from the data."""
-        return len(self.columns) + self.searched
+        return len(self.columns) * self.places_count + self.searched
 
 
 @dataclass(frozen=True, slots=True)

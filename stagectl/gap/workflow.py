@@ -58,16 +58,20 @@ def find(
     chosen = judge.select(until=lambda group: moves_joint(first, group))
     last, named = first, _all_named(first, chosen)
     moving = [group for group in chosen if moves_joint(first, group)]
-    if moving:
-        say("once more, at the place where the joint is now known to be")
+    if chosen:
+        say("once more, along the motion and at the place where the joint is now known to be")
         moved = tuple(moved_by(first, chosen, group) for group in moving)
-        kept = tuple(first.term(group) for group in chosen if group not in moving)
+        still = [group for group in chosen if group not in moving]
+        explained = first.explained(still)
         there, moved = settled(unsettled, noise, moved)
+        there = [balance.foretold_under(r, balance.sum_of(balance.known_forces(r), explained(r))) for r in there]
+        noise = noise_of(there, explained)
+        kept = tuple(first.term(group) for group in still)
         last = Competition(there, len(training), seed=seed, without=without, moved=moved, kept=kept, noise=noise)
         last.judge.threshold = judge.threshold
         last.judge.trace = judge.trace
         chosen = last.judge.select(last.kept)
-        named = remeasured(last, chosen, named, moved) + _all_named(last, chosen)
+        named = (remeasured(last, chosen, named, moved) if moved else ()) + _all_named(last, chosen)
     after = last.judge.reducible(chosen)
     unknown = _unknown(last, chosen, before_excess=_excess(first, []))
     verdict = "unknown" if unknown is not None else "found" if named else "nothing"
