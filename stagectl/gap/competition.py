@@ -76,7 +76,7 @@ class Competition:
         dry = {
             f"{row['name']} on {row['acts_on']}"
             for row in self.evidence.recordings[0].believed.effects
-            if "smoothing_m_per_s" in CATALOGUE[row["name"]].parameters
+            if CATALOGUE[row["name"]].has_step
         }
         columns = [g.columns[0] for (t, _), g in zip(self.parameters, self.judge.base, strict=False) if t.name in dry]
         return float(sum(s.gram[c, c] for s in self.evidence.sums for c in columns))

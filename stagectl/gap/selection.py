@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap.normal_equations import Fold, Group, Sums, held_out_gain, solve, within_bounds
 
 NULL_QUANTILE = 0.99
@@ -20,10 +21,9 @@ MATERIAL_RATIO = 0.005
 SEARCH_PRICE = 2.0
 """What a shape that is searched beyond the grid gains on noise, at most about (chi square of one number)."""
 
-MEASURED_COLUMNS = frozenset({"flexible_mode"})
 MEASURED_GAIN = 120.0
-"""Columns made of the measured acceleration share noise with the innovations, which no draw of noise through them
-shows: a flexible mode gained 61 where nothing was missing."""
+"""What a force that answers the acceleration must gain besides: columns made of the measured acceleration share noise
+with the innovations, which no draw of noise through them shows: a flexible mode gained 61 where nothing was missing."""
 
 RIVALS_COUNT = 6
 """Names whose shapes are searched in each round."""
@@ -32,10 +32,9 @@ ALIAS_GAIN = 8.6
 """Log-likelihood ratio (twice) below which two names can't be told apart: power 0.9 at 5 % false alarms."""
 
 ALIAS_SHARE = 0.002
-LATE_READINGS = frozenset({"sensor_delay", "sensor_lag"})
 LATE_SHARE = 0.12
-"""Late readings and prompt commands disagree on the velocity that both laws are made of: a lag of 0.45 ms at d' 45 lost
-a tenth of its gain to a delay."""
+"""The share between two late readings: beside prompt commands they disagree on the velocity that both laws are made of,
+and a lag of 0.45 ms at d' 45 lost a tenth of its gain to a delay."""
 
 
 class Source(Protocol):
@@ -120,7 +119,7 @@ class Judge:
         Ends early with a hypothesis of which `until` says that everything has to be looked at anew.
         """
         chosen = list(start)
-        seen: set[frozenset[object]] = set()
+        seen: set[frozenset[tuple[str, str]]] = set()
         while len(chosen) < most:
             rivals = self.rivals(chosen)
             passing = [group for group in rivals if self._stays(chosen, group) and self._allowed([*chosen, group])]
@@ -145,7 +144,7 @@ class Judge:
     def _ranked(self, chosen: Sequence[Group], most: int) -> list[Group]:
         """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
         fold = Fold([*self.base, *chosen], self.source.sums, self.source.sums, on_noise=False)
-        best: dict[object, tuple[float, Group]] = {}
+        best: dict[tuple[str, str], tuple[float, Group]] = {}
         taken = {group.key for group in chosen}
         at_size = self.gain_at_size([*self.base, *chosen])
         for group in self.library:
@@ -219,7 +218,8 @@ class Judge:
 
     def _threshold_of(self, group: Group) -> float:
         """Return what a hypothesis has to gain to stand out of noise, searched shapes and measured columns included."""
-        measured = MEASURED_GAIN if group.key[0] in MEASURED_COLUMNS else 0.0  # pyright: ignore[reportIndexIssue]
+        known = CATALOGUE.get(group.key[0])
+        measured = MEASURED_GAIN if known is not None and known.answers_acceleration else 0.0
         return self.threshold + SEARCH_PRICE * group.searched + measured
 
     def _without_superfluous(self, chosen: list[Group]) -> list[Group]:
@@ -235,18 +235,23 @@ class Judge:
             chosen = rest
         return chosen
 
-    def aliases(self, chosen: Sequence[Group], group: Group) -> list[tuple[object, float]]:
+    def aliases(self, chosen: Sequence[Group], group: Group) -> list[tuple[tuple[str, str], float]]:
         """Return the keys that would do as well as `group` beside the others, with the margin that they lose by."""
         rest = [other for other in chosen if other is not group]
         with_it = self.gain(chosen)
         gained = with_it - self.gain(rest)
-        margins: dict[object, float] = {}
+        margins: dict[tuple[str, str], float] = {}
         taken = {other.key for other in chosen}
         for other in self.rivals(rest):
             if other.key in taken or other.complexity > group.complexity or not self._allowed([*rest, other]):
                 continue
             margin = with_it - self.gain([*rest, other])
-            late = {str(key[0]) for key in (group.key, other.key)} <= LATE_READINGS  # pyright: ignore[reportIndexIssue]
+            late = _is_late_reading(group) and _is_late_reading(other)
             if margin < ALIAS_GAIN + (LATE_SHARE if late else ALIAS_SHARE) * gained:
                 margins[other.key] = margin
         return sorted(margins.items(), key=lambda row: row[1])
+
+
+def _is_late_reading(group: Group) -> bool:
+    known = CATALOGUE.get(group.key[0])
+    return known is not None and Trait.LATE_READING in known.traits
