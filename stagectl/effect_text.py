@@ -177,7 +177,7 @@ def _declared_names(tree: ast.Module) -> tuple[str, ...]:
 
 def _try(known: Effect, title: str) -> None:
     """Compile one effect and hold it to its declaration. Errors: ProfileError, or what its text raises."""
-    if "pitch_m" in known.parameters and (strange := [n for n in shape_of(known) if n != "pitch_m"]):
+    if "pitch_m" in known.parameters and (strange := [n for n in known.shape if n != "pitch_m"]):
         raise ProfileError(f"{title}: {known.name} has a pitch_m beside {strange[0]}; call it period_m")
     sides = [known.bounds[name] for name in known.parameters]
     for share in (0.0, 0.5, 1.0):
@@ -222,11 +222,6 @@ def _output(
     quantities = [given.get(name, motion) for name in known.quantities]
     remembered = [np.zeros(known.memory) if memory is None else memory] if known.memory else []
     return known.compiled_law(*quantities, *values, *remembered)
-
-
-def shape_of(known: Effect) -> tuple[str, ...]:
-    """Return the parameters that no solving finds: those that it is not linear in, but for phases."""
-    return tuple(name for name in known.parameters if name not in known.linear and not name.endswith("phase_rad"))
 
 
 def _first_lines(error: BaseException) -> str:

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stagectl import compose
-from stagectl.effects import CATALOGUE, PLACES, QUANTITIES_OF, TAGS, effect
+from stagectl.effects import CATALOGUE, MOTIONS, PLACES, QUANTITIES_OF, TAGS, Trait, effect
+from stagectl.gap import next_move
 from stagectl.units import unit_of
 from tests.effect_numbers import PARAMETERS, WORKED, columns, motion
 
@@ -270,6 +271,64 @@ def test_a_new_law_with_memory(catalogue):
     memory = np.array([0.5])
     assert known.compiled_law(2.0, 0.25, 0.5, memory) == -0.5
     assert memory.tolist() == [1.0]
+
+
+def test_what_a_search_knows_of_a_law_is_declared_with_it(catalogue):
+    @effect(
+        places=("macro_sensor",),
+        traits=("late reading",),
+        searched=("delay_s",),
+        shown_by="acceleration",
+        symptom="odd",
+        reference="this test",
+        delay_s=(0.0, 1.0),
+    )
+    def late(velocity_m_per_s, delay_s):
+        """Reading of an earlier instant: -v T."""
+        return -velocity_m_per_s * delay_s
+
+    known = catalogue["late"]
+    assert known.traits == {Trait.LATE_READING}
+    assert (known.searched, known.shape, known.shown_by) == (("delay_s",), ("delay_s",), "acceleration")
+    assert (known.has_step, known.answers_acceleration, known.period) == (False, False, "")
+
+
+@pytest.mark.parametrize(
+    ("declared", "said"),
+    [
+        ({"traits": ("early reading",)}, "unknown trait 'early reading'; choose from ['base',"),
+        ({"searched": ("width_m",)}, "width_m is searched, and is no parameter"),
+        ({"searched": ("level_n",), "linear": ("level_n",)}, "level_n is linear, so it is solved for"),
+        ({"shown_by": "a wave"}, "shown by an unknown motion 'a wave'"),
+    ],
+)
+def test_what_a_search_can_not_know_of_a_law(declared, said):
+    def wrong(velocity_m_per_s, level_n):
+        """Wrong."""
+        return level_n * velocity_m_per_s
+
+    assert said in refused(wrong, level_n=(0.0, 1.0), **declared)
+
+
+def test_what_laws_say_by_their_arguments():
+    """Steps, resonances and periods are in the text of a law: nobody lists their names."""
+    steps = {name for name, known in CATALOGUE.items() if known.has_step}
+    assert {"coulomb_friction", "stribeck_friction", "contact_hysteresis"} <= steps
+    assert not steps & {"viscous_friction", "dahl_friction", "cogging"}
+    answering = {name for name, known in CATALOGUE.items() if known.answers_acceleration}
+    assert answering == {"mass_error", "flexible_mode"}  # a reading that is late moves nothing
+    periods = {name: known.period for name, known in CATALOGUE.items() if known.period}
+    assert periods == {
+        "cogging": "pitch_m",
+        "harmonic_cogging": "pitch_m",
+        "current_ripple": "pitch_m",
+        "base_vibration": "frequency_hz",
+    }
+
+
+def test_every_kind_of_motion_has_its_moves():
+    assert set(next_move.MOVES) == {*MOTIONS, ""}
+    assert all(next_move.MOVES[motion] for motion in MOTIONS)
 
 
 def test_declared_twice():

@@ -14,13 +14,16 @@ from stagectl.effects import contact, drive, friction, inertia, periodic, sensor
 from stagectl.effects.declaration import (
     CATALOGUE,
     CONTACT_QUANTITIES,
+    MOTIONS,
     PLACES,
     QUANTITIES,
     QUANTITIES_OF,
     TAGS,
     Effect,
+    Trait,
     effect,
 )
 
-__all__ = ["CATALOGUE", "CONTACT_QUANTITIES", "PLACES", "QUANTITIES", "QUANTITIES_OF", "TAGS", "Effect", "effect"]
+__all__ = ["CATALOGUE", "CONTACT_QUANTITIES", "MOTIONS", "PLACES", "QUANTITIES", "QUANTITIES_OF", "TAGS"]
+__all__ += ["Effect", "Trait", "effect"]
 __all__ += ["contact", "drive", "friction", "inertia", "periodic", "sensor", "stiffness", "table"]

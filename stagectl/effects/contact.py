@@ -6,13 +6,14 @@ by its own.
 
 import numpy as np
 
-from stagectl.effects.declaration import effect
+from stagectl.effects.declaration import Trait, effect
 
 
 @effect(
     places=("contact",),
     damping_n_s_per_m=(0.0, 1e5),
     linear=("damping_n_s_per_m",),
+    shown_by="contact",
     symptom="proportional to the speed of the joint, in contact only",
     reference="Kelvin-Voigt contact; Kang et al. 2023, section 6.1",
 )
@@ -26,6 +27,7 @@ def contact_damping(penetration_velocity_m_per_s, damping_n_s_per_m):
     left_error_ratio=(-0.9, 2.0),
     right_error_ratio=(-0.9, 2.0),
     linear=("left_error_ratio", "right_error_ratio"),
+    traits=(Trait.KNOWN_PARAMETER,),
     symptom="proportional to the penetration, with another share on each side",
     reference="Kang et al. 2023, (5), K_l and K_r",
 )
@@ -41,6 +43,8 @@ def contact_stiffness_error(
 @effect(
     places=("contact",),
     knee_m=(1e-8, 1e-3),
+    searched=("knee_m",),
+    shown_by="contact",
     symptom="contact force that sets in gently: less than linear by the same amount from a few micrometres on",
     reference="Kang et al. 2023, section 6.1: a rounded knee; Johnson, Contact Mechanics, section 4.3",
 )
@@ -55,6 +59,7 @@ def soft_contact(penetration_m, contact_stiffness_n_per_m, knee_m):
     loss_ratio=(0.0, 0.9),
     smoothing_m_per_s=(1e-7, 1e-1),
     linear=("loss_ratio",),
+    shown_by="contact",
     symptom="contact force larger when pressing than when letting go, whatever the speed",
     reference="Kang et al. 2023, section 6.1: a loop in the measured contact; Kimball, Lovell, Phys. Rev. 30, 1927",
 )
@@ -70,6 +75,7 @@ def contact_hysteresis(
     places=("contact_edge",),
     change_m=(-1e-2, 1e-2),
     linear=("change_m",),
+    traits=(Trait.KNOWN_PARAMETER,),
     symptom="contact sets in later (or earlier), by the same on both sides",
     reference="Kang et al. 2023, (5): b = b_l + b_r",
 )
@@ -83,6 +89,7 @@ def backlash_width_change(contact_side_ratio, change_m):
     shift_m=(-1e-2, 1e-2),
     linear=("shift_m",),
     session=("shift_m",),
+    shown_by="contact",
     symptom="contact sets in later on one side, and earlier by the same on the other",
     reference="Kang et al. 2023, (5): (b_r - b_l) / 2; belongs to one homing",
 )
@@ -95,6 +102,7 @@ def backlash_centre_shift(contact_side_ratio, shift_m):
     places=("contact_edge",),
     rate_m_per_s=(-1e-4, 1e-4),
     linear=("rate_m_per_s",),
+    shown_by="contact",
     symptom="contact sets in later and later in the course of a run",
     reference="Archard, J. Appl. Phys. 24, 1953, at constant load and motion: depth grows with time",
 )

@@ -12,6 +12,7 @@ and leaves its memory alone.
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -76,6 +77,19 @@ PLACES = tuple(QUANTITIES_OF)
 TAGS = ("structural", "session", "run")
 """How long a parameter lives: as long as the machine, until the next homing or power-up, for one run."""
 
+
+class Trait(StrEnum):
+    """What a search for missing effects has to know of a law, and its text can't say."""
+
+    BASE = "base"  # what the base does: felt by everything that stands on it
+    KNOWN_PARAMETER = "known parameter"  # says the same as a parameter of the machine that is wrong
+    LATE_READING = "late reading"  # a reading of an earlier instant: two such laws differ in what rounds the motion
+    FIRST_ORDER = "first order"  # moves a reading by so little that no force feels it
+
+
+MOTIONS = ("low speed", "strokes", "acceleration", "holds", "contact", "time")
+"""Kinds of motion on which an effect may show best: `stagectl.gap.next_move` has the moves of each."""
+
 _ALL_QUANTITIES = frozenset(name for names in QUANTITIES_OF.values() for name in names)
 _MEMORY = "memory"
 
@@ -96,12 +110,33 @@ class Effect:
     memory: int  # floats
     linear: tuple[str, ...]  # parameters that the output is linear in, all of them together
     tags: dict[str, str]  # of every parameter, one of TAGS
+    traits: frozenset[Trait]
+    searched: tuple[str, ...]  # shape parameters for which no grid is fine enough
+    shown_by: str  # one of MOTIONS, "" where it is none of them in particular
     origin: str = ""  # hash of the text that it comes from, where that is a user's own
 
     @property
     def summary(self) -> str:
         """First line of the law's docstring."""
         return (inspect.getdoc(self.law) or "").splitlines()[0]
+
+    @property
+    def has_step(self) -> bool:
+        """Whether it jumps where a velocity changes its sign; the smoothing stands for the sign."""
+        return "smoothing_m_per_s" in self.parameters
+
+    @property
+    def period(self) -> str:
+        """The parameter with which it repeats: a pitch over position, a frequency over time; "" where it does not."""
+        if "pitch_m" in self.parameters:
+            return "pitch_m"
+        repeats = "t_s" in self.quantities and "phase_rad" in self.parameters and self.shape == ("frequency_hz",)
+        return "frequency_hz" if repeats else ""
+
+    @property
+    def shape(self) -> tuple[str, ...]:
+        """The parameters that no solving finds: those that it is not linear in, but for phases."""
+        return tuple(n for n in self.parameters if n not in self.linear and not n.endswith("phase_rad"))
 
 
 CATALOGUE: dict[str, Effect] = {}
@@ -117,12 +152,16 @@ def effect(
     linear: tuple[str, ...] = (),
     session: tuple[str, ...] = (),
     run: tuple[str, ...] = (),
+    traits: tuple[str, ...] = (),
+    searched: tuple[str, ...] = (),
+    shown_by: str = "",
     **bounds: tuple[float, float],
 ):
     """Declare the decorated function as an effect; wrong declarations raise TypeError at import.
 
     `memory`: length of its memory. `linear`: parameters that it is linear in. `session`, `run`: parameters that last
-    until the next homing, or for one run only; all others are structural.
+    until the next homing, or for one run only; all others are structural. `traits`, `searched`, `shown_by`: for
+    `stagectl gap`; see Trait, Effect and MOTIONS.
     """
 
     def declare(law: Callable[..., float]) -> Callable[..., float]:
@@ -148,6 +187,14 @@ def effect(
             problem = f"argument {nameless[0]} states no unit"
         elif strange := [key for key in (*linear, *session, *run) if key not in parameters]:
             problem = f"{strange[0]} is tagged or linear, and is no parameter; there are {parameters}"
+        elif strange := [key for key in searched if key not in parameters]:
+            problem = f"{strange[0]} is searched, and is no parameter; there are {parameters}"
+        elif solved := [key for key in searched if key in linear]:
+            problem = f"{solved[0]} is linear, so it is solved for and not searched"
+        elif strange := [trait for trait in traits if trait not in list(Trait)]:
+            problem = f"unknown trait {strange[0]!r}; choose from {[str(trait) for trait in Trait]}"
+        elif shown_by and shown_by not in MOTIONS:
+            problem = f"is shown by an unknown motion {shown_by!r}; choose from {MOTIONS}"
         elif both := [key for key in session if key in run]:
             problem = f"{both[0]} can't last for a session and for a run"
         if problem:
@@ -155,7 +202,7 @@ def effect(
         tags = {key: "session" if key in session else "run" if key in run else "structural" for key in parameters}
         CATALOGUE[name] = Effect(
             name, law, compiled(law), quantities, parameters, places, dict(bounds), symptom, reference,
-            memory, linear, tags,
+            memory, linear, tags, frozenset(map(Trait, traits)), searched, shown_by,
         )  # fmt: skip
         return law
 

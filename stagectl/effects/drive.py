@@ -5,7 +5,7 @@ Command effects add amperes to what the drive is told; actuator effects add newt
 
 import numpy as np
 
-from stagectl.effects.declaration import effect
+from stagectl.effects.declaration import Trait, effect
 
 _ACTUATORS = ("macro_actuator", "micro_actuator")
 _COMMANDS = ("macro_command", "micro_command")
@@ -16,6 +16,7 @@ _CHANGES_COUNT = 8  # of the command that are on their way at once
     places=_ACTUATORS,
     error_ratio=(-0.2, 0.2),
     linear=("error_ratio",),
+    traits=(Trait.KNOWN_PARAMETER,),
     symptom="proportional to the motor's force",
     reference="Kang et al. 2023, (4), K_m",
 )
@@ -27,6 +28,8 @@ def force_constant_error(motor_force_n, error_ratio):
 @effect(
     places=_ACTUATORS,
     saturation_n=(1.0, 1e6),
+    searched=("saturation_n",),
+    shown_by="acceleration",
     symptom="odd in the motor's force, with its cube: the force constant falls where the current is large",
     reference="Gieras, Piech, Zhou, Linear Synchronous Motors, section 3.6: iron that saturates; tanh as its curve",
 )
@@ -38,6 +41,7 @@ def force_constant_saturation(motor_force_n, saturation_n):
 @effect(
     places=_COMMANDS,
     half_width_a=(0.0, 10.0),
+    searched=("half_width_a",),
     symptom="no force for small commands, and a constant part missing of larger ones",
     reference="Slotine, Li, Applied Nonlinear Control, section 5.2: dead zone; amplifiers without bias current",
 )
@@ -50,6 +54,8 @@ def amplifier_dead_band(command_a, half_width_a):
     places=_COMMANDS,
     memory=1,
     time_constant_s=(1e-6, 0.02),
+    searched=("time_constant_s",),
+    shown_by="acceleration",
     symptom="proportional to the change of the command; fades with one time constant",
     reference="Franklin, Powell, Workman, Digital Control of Dynamic Systems, section 4.3: first-order lag, held input",
 )
@@ -70,6 +76,8 @@ def current_loop_lag(command_a, dt_s, time_constant_s, memory):
     places=_COMMANDS,
     memory=2 + 2 * _CHANGES_COUNT,
     delay_s=(0.0, 0.005),
+    searched=("delay_s",),
+    shown_by="acceleration",
     symptom="the command's change, times the delay; the same for slow and for fast commands",
     reference="Astrom, Wittenmark, Computer-Controlled Systems, section 2.3: dead time with a held input",
 )

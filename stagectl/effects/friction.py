@@ -14,6 +14,7 @@ _LEAST_SPEED_M_PER_S = 1e-4  # below it the sub-linear law is linear: its slope 
     places=_AXES,
     damping_n_s_per_m=(0.0, 1e5),
     linear=("damping_n_s_per_m",),
+    shown_by="strokes",
     symptom="odd in velocity and proportional to it",
     reference="Kang et al. 2023, (1) and (2), b1 and b2",
 )
@@ -27,6 +28,7 @@ def viscous_friction(velocity_m_per_s, damping_n_s_per_m):
     forward_n_s_per_m=(0.0, 1e5),
     backward_n_s_per_m=(0.0, 1e5),
     linear=("forward_n_s_per_m", "backward_n_s_per_m"),
+    shown_by="strokes",
     symptom="proportional to velocity, with another slope in each direction",
     reference="Janot, Young, Gautier, Int. J. Control 90(3), 2017: the EMPS axis, 167 and 240 N s/m",
 )
@@ -41,6 +43,7 @@ def asymmetric_viscous_friction(velocity_m_per_s, forward_n_s_per_m, backward_n_
     level_n=(0.0, 1e3),
     smoothing_m_per_s=_SMOOTHING,
     linear=("level_n",),
+    shown_by="low speed",
     symptom="odd in velocity; a step at each reversal",
     reference="Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994",
 )
@@ -55,6 +58,7 @@ def coulomb_friction(velocity_m_per_s, level_n, smoothing_m_per_s):
     backward_n=(0.0, 1e3),
     smoothing_m_per_s=_SMOOTHING,
     linear=("forward_n", "backward_n"),
+    shown_by="low speed",
     symptom="a step at each reversal, of another size in each direction; an offset looks like the difference",
     reference="Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994, section 2",
 )
@@ -71,6 +75,8 @@ def asymmetric_coulomb_friction(velocity_m_per_s, forward_n, backward_n, smoothi
     stribeck_m_per_s=(1e-6, 1.0),
     smoothing_m_per_s=_SMOOTHING,
     linear=("excess_n",),
+    searched=("stribeck_m_per_s",),
+    shown_by="low speed",
     symptom="odd in velocity; friction rises towards standstill, over a few mm/s",
     reference="Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994, (7) with exponent 2",
 )
@@ -85,6 +91,8 @@ def stribeck_friction(velocity_m_per_s, excess_n, stribeck_m_per_s, smoothing_m_
     level_n=(0.0, 1e3),
     exponent_ratio=(0.1, 0.95),
     linear=("level_n",),
+    searched=("exponent_ratio",),
+    shown_by="low speed",
     symptom="odd in velocity; grows fast at low speed and slowly at high speed",
     reference="Waiboer, Aarts, Jonker, ASME DETC 2005: asperity and viscous part of joint friction, power below one",
 )
@@ -98,6 +106,7 @@ def sublinear_viscous_friction(velocity_m_per_s, level_n, exponent_ratio):
     places=_AXES,
     drag_n_s2_per_m2=(0.0, 1e5),
     linear=("drag_n_s2_per_m2",),
+    shown_by="strokes",
     symptom="odd in velocity, with its square",
     reference="Batchelor, An Introduction to Fluid Dynamics, section 5.11: drag at high Reynolds number",
 )
@@ -111,6 +120,7 @@ def quadratic_drag(velocity_m_per_s, drag_n_s2_per_m2):
     coefficient_ratio=(0.0, 1.0),
     smoothing_m_per_s=_SMOOTHING,
     linear=("coefficient_ratio",),
+    shown_by="acceleration",
     symptom="odd in velocity, and larger where the motor pushes harder",
     reference="Linderoth, Stolt, Robertsson, Johansson, ICRA 2013: friction of a joint under load",
 )
@@ -125,6 +135,8 @@ def load_dependent_friction(velocity_m_per_s, motor_force_n, coefficient_ratio, 
     level_n=(0.0, 1e3),
     slip_m=(1e-8, 1e-3),
     linear=("level_n",),
+    searched=("slip_m",),
+    shown_by="low speed",
     symptom="a spring over the first micrometres after each reversal, then Coulomb friction",
     reference="Dahl, A Solid Friction Model, Aerospace Corp. TOR-0158, 1968, exponent 1",
 )
@@ -147,6 +159,8 @@ def dahl_friction(velocity_m_per_s, dt_s, level_n, slip_m, memory):
     stribeck_m_per_s=(1e-6, 1.0),
     slip_m=(1e-8, 1e-3),
     linear=("level_n",),
+    searched=("slip_m", "static_ratio", "stribeck_m_per_s"),
+    shown_by="low speed",
     symptom="a spring over the first micrometres after each reversal, a peak at break-away, then Coulomb friction",
     reference="Canudas de Wit, Olsson, Astrom, Lischinsky, IEEE Trans. Automatic Control 40(3), 1995, (1)-(3)",
 )

@@ -6,7 +6,7 @@ They take the acceleration of the substep before. An error e of the mass then se
 
 import numpy as np
 
-from stagectl.effects.declaration import effect
+from stagectl.effects.declaration import Trait, effect
 
 _AXES = ("macro_force", "micro_force")
 
@@ -15,6 +15,7 @@ _AXES = ("macro_force", "micro_force")
     places=("macro_force",),
     fraction_ratio=(0.0, 1.0),
     linear=("fraction_ratio",),
+    shown_by="acceleration",
     symptom="the voice coil's force, mirrored on the macro",
     reference="Newton's third law on Kang et al. 2023, (1): the voice coil's stator rides on the macro",
 )
@@ -27,6 +28,7 @@ def micro_reaction(micro_motor_force_n, fraction_ratio):
     places=_AXES,
     error_ratio=(-0.5, 0.5),
     linear=("error_ratio",),
+    traits=(Trait.KNOWN_PARAMETER,),
     symptom="proportional to acceleration; a force constant that is too small looks alike on one axis",
     reference="Newton",
 )
@@ -41,6 +43,8 @@ def mass_error(acceleration_m_per_s2, mass_kg, error_ratio):
     share_ratio=(0.0, 0.5),
     frequency_hz=(5.0, 500.0),
     damping_ratio=(1e-3, 0.7),
+    searched=("frequency_hz", "damping_ratio"),
+    shown_by="acceleration",
     symptom="rings at one frequency after each change of acceleration",
     reference="Den Hartog, Mechanical Vibrations, section 3.2: a mass on a spring, moved by its base",
 )
@@ -78,6 +82,8 @@ def flexible_mode(acceleration_m_per_s2, mass_kg, dt_s, share_ratio, frequency_h
     phase_rad=(-7.0, 7.0),
     linear=("amplitude_m_per_s2",),
     run=("phase_rad",),
+    traits=(Trait.BASE,),
+    searched=("frequency_hz",),
     symptom="periodic in time, whatever the motion, and on both axes in the ratio of their masses",
     reference="Newton in a frame that shakes; ISO 2631-2 for what a floor does",
 )

@@ -16,6 +16,8 @@ _PHASE = (-7.0, 7.0)  # rad
     phase_rad=_PHASE,
     linear=("amplitude_n",),
     session=("phase_rad",),
+    searched=("pitch_m",),
+    shown_by="strokes",
     symptom="periodic in position, whatever the velocity",
     reference="Roehrig, Jochheim, Proc. ACC 2001: force ripple of linear motors",
 )
@@ -49,6 +51,8 @@ def harmonic_cogging(position_m, first_n, second_n, pitch_m, first_phase_rad, se
     phase_rad=_PHASE,
     linear=("ripple_ratio",),
     session=("phase_rad",),
+    searched=("pitch_m",),
+    shown_by="acceleration",
     symptom="periodic in position and proportional to the motor's force",
     reference="Roehrig, Jochheim, Proc. ACC 2001: force constant that changes with position",
 )

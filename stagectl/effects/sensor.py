@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stagectl.effects.declaration import effect
+from stagectl.effects.declaration import Trait, effect
 
 _SENSORS = ("macro_sensor", "end_sensor")
 _PHASE = (-7.0, 7.0)  # rad
@@ -11,6 +11,9 @@ _PHASE = (-7.0, 7.0)  # rad
 @effect(
     places=_SENSORS,
     delay_s=(-0.01, 0.01),
+    traits=(Trait.LATE_READING,),
+    searched=("delay_s",),
+    shown_by="acceleration",
     symptom="proportional to velocity, on the reading",
     reference="Taylor; a position at t - T of a stage whose acceleration stands still for T",
 )
@@ -23,6 +26,9 @@ def sensor_delay(velocity_m_per_s, acceleration_m_per_s2, delay_s):
     places=_SENSORS,
     memory=1,
     time_constant_s=(1e-6, 0.05),
+    traits=(Trait.LATE_READING,),
+    searched=("time_constant_s",),
+    shown_by="acceleration",
     symptom="proportional to velocity, on the reading, and rounded where the acceleration changes",
     reference="Franklin, Powell, Workman, Digital Control of Dynamic Systems, section 4.3: first-order lag of a ramp",
 )
@@ -42,6 +48,7 @@ def sensor_lag(velocity_m_per_s, acceleration_m_per_s2, dt_s, time_constant_s, m
     places=_SENSORS,
     error_ppm=(-1000.0, 1000.0),
     linear=("error_ppm",),
+    shown_by="strokes",
     symptom="proportional to position, on the reading",
     reference="ISO 230-2; index of air, wavelength, cosine error",
 )
@@ -59,6 +66,8 @@ def scale_error(position_m, error_ppm):
     second_phase_rad=_PHASE,
     linear=("first_m", "second_m"),
     session=("first_phase_rad", "second_phase_rad"),
+    traits=(Trait.FIRST_ORDER,),
+    shown_by="strokes",
     symptom="periodic in position with half (and a quarter of) the laser's wavelength, on the reading",
     reference="Wu, Deslattes, Rev. Sci. Instrum. 69(7), 1998; Heydemann, Applied Optics 20(19), 1981",
 )
@@ -73,6 +82,8 @@ def cyclic_error(position_m, first_m, second_m, wavelength_m, first_phase_rad, s
     drift_m=(-1e-3, 1e-3),
     time_constant_s=(1.0, 1e5),
     linear=("drift_m",),
+    searched=("time_constant_s",),
+    shown_by="time",
     symptom="grows with time and levels off, on the reading, whatever the motion",
     reference="ISO 230-3: thermal drift of a lumped mass after a step in temperature",
 )
@@ -87,6 +98,7 @@ def thermal_drift(t_s, drift_m, time_constant_s):
     centre_m=(-10.0, 10.0),
     linear=("bow_per_m",),
     session=("centre_m",),
+    shown_by="strokes",
     symptom="with the square of the position, on the reading",
     reference="Bryan, Precision Engineering 1(3), 1979: the Abbe principle revisited; ISO 230-1",
 )
@@ -103,6 +115,7 @@ def abbe_error(position_m, bow_per_m, centre_m):
     places=_SENSORS,
     skew_ppm=(-1000.0, 1000.0),
     linear=("skew_ppm",),
+    shown_by="time",
     symptom="proportional to velocity, on the reading, and growing in the course of a run",
     reference="IEEE 1588, clause on rate offset: instants of a clock that runs fast by e are early by e t",
 )

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stagectl.effects.declaration import effect
+from stagectl.effects.declaration import Trait, effect
 
 _AXES = ("macro_force", "micro_force")
 _GRAVITY_M_PER_S2 = 9.80665  # standard gravity, ISO 80000-3
@@ -12,6 +12,7 @@ _GRAVITY_M_PER_S2 = 9.80665  # standard gravity, ISO 80000-3
     places=_AXES,
     force_n=(-1e3, 1e3),
     linear=("force_n",),
+    shown_by="holds",
     symptom="constant",
     reference="Newton; tilt, amplifier offset and preload look alike",
 )
@@ -24,6 +25,8 @@ def offset(t_s, force_n):
     places=_AXES,
     grade_ratio=(-0.2, 0.2),
     linear=("grade_ratio",),
+    traits=(Trait.BASE,),
+    shown_by="holds",
     symptom="constant, and on both axes in the ratio of their masses",
     reference="Newton; weight along a plane of sine g",
 )
@@ -38,6 +41,8 @@ def gravity_tilt(mass_kg, grade_ratio):
     anchor_m=(-10.0, 10.0),
     linear=("stiffness_n_per_m",),
     session=("anchor_m",),
+    searched=("anchor_m",),
+    shown_by="holds",
     symptom="linear in position",
     reference="Hooke; cable carriers of linear stages",
 )
@@ -53,6 +58,8 @@ def cable_spring(position_m, stiffness_n_per_m, anchor_m):
     slip_m=(1e-5, 0.5),
     exponent_ratio=(0.0, 0.999),
     linear=("level_n",),
+    searched=("slip_m",),
+    shown_by="holds",
     symptom="a spring over the first millimetres after each reversal, then a constant drag",
     reference="Dahl, A Solid Friction Model, Aerospace Corp. TOR-0158, 1968; with p = 0 one Maxwell-slip element",
 )
@@ -74,6 +81,7 @@ def cable_hysteresis(velocity_m_per_s, dt_s, level_n, slip_m, exponent_ratio, me
     places=(*_AXES, "joint"),
     stiffness_n_per_m=(-1e6, 1e6),
     linear=("stiffness_n_per_m",),
+    shown_by="holds",
     symptom="linear in position, zero at zero; on the joint in the relative position, opposite on both axes",
     reference="Hooke; Kang et al. 2023, (1) and (2), K1 and K2",
 )
@@ -99,6 +107,7 @@ def cubic_stiffness(position_m, stiffness_n_per_m3):
     slope_n_per_m=(-1e4, 1e4),
     smoothing_m_per_s=(1e-7, 1e-1),
     linear=("slope_n_per_m",),
+    shown_by="strokes",
     symptom="a step at each reversal that grows along the way",
     reference="Armstrong-Helouvry, Control of Machines with Friction, 1991, chapter 4: friction along the way",
 )

@@ -78,7 +78,7 @@ def _area(start: np.ndarray, goal: np.ndarray, low: float, high: float, origin: 
 def changed_by(
     effect: Effect, parameters: list[float], command: np.ndarray, latch_s: float, lag_s: float, period_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what an effect adds to what the drive makes of held commands: means over parts (n, parts), at samples (n,).
+    """Return what an effect adds to a drive's answer to held commands: means over parts (n, parts), at samples (n,).
 
     Effects that are neither linear nor without memory are run on means over parts of intervals.
     """

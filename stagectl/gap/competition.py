@@ -77,7 +77,7 @@ class Competition:
         dry = {
             f"{row['name']} on {row['acts_on']}"
             for row in self.evidence.recordings[0].believed.effects
-            if "smoothing_m_per_s" in CATALOGUE[row["name"]].parameters
+            if CATALOGUE[row["name"]].has_step
         }
         columns = [g.columns[0] for (t, _), g in zip(self.parameters, self.judge.base, strict=False) if t.name in dry]
         return float(sum(s.gram[c, c] for s in self.evidence.sums for c in columns))
@@ -105,7 +105,7 @@ class Competition:
         return self.evidence.terms[group.columns[0]]
 
     def explained(self, chosen: Sequence[Group]) -> Explained:
-        """Return what known parameters and `chosen` effects add in a recording, at the sizes that all recordings give."""
+        """Return what known parameters and `chosen` effects add in a recording, at the sizes that all of them give."""
         solution = solve([*self.judge.base, *chosen], self.evidence.sums)
         values = {
             (column, scope): float(value)

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stagectl.effect_text import shape_of
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.effects.table import TABLES
 from stagectl.gap.balance import Recording
@@ -19,32 +18,10 @@ Stribeck friction was left as at 0.01 mm/s. Rigs and measured machines are round
 
 _LASER_M = 632.8e-9
 
-FREE_SHAPES: dict[str, tuple[str, ...]] = {
-    "stribeck_friction": ("stribeck_m_per_s",),
-    "sublinear_viscous_friction": ("exponent_ratio",),
-    "dahl_friction": ("slip_m",),
-    "lugre_friction": ("slip_m", "static_ratio", "stribeck_m_per_s"),
-    "cable_hysteresis": ("slip_m",),
-    "cable_spring": ("anchor_m",),
-    "soft_contact": ("knee_m",),
-    "force_constant_saturation": ("saturation_n",),
-    "amplifier_dead_band": ("half_width_a",),
-    "current_loop_lag": ("time_constant_s",),
-    "command_delay": ("delay_s",),
-    "flexible_mode": ("frequency_hz", "damping_ratio"),
-    "sensor_delay": ("delay_s",),
-    "sensor_lag": ("time_constant_s",),
-    "thermal_drift": ("time_constant_s",),
-    "cogging": ("pitch_m",),
-    "current_ripple": ("pitch_m",),
-    "base_vibration": ("frequency_hz",),
-}
-"""Shapes that are searched beyond the grid, by effect."""
-
 
 def free_shapes(known: Effect) -> tuple[str, ...]:
     """Return the shape parameters of an effect that are searched beyond the grid; all, where it is the user's own."""
-    return tuple(shape_of(known)) if known.origin else FREE_SHAPES.get(known.name, ())
+    return known.shape if known.origin else known.searched
 
 
 Grid = dict[str, list[dict[str, float]]]
@@ -103,7 +80,7 @@ _WIDE = 20.0  # ratio of bounds from which steps are ratios
 
 def _grid_of(known: Effect) -> list[dict[str, float]]:
     """Return shapes between the bounds of a user's effect; its files of others in this process have none."""
-    names = shape_of(known)
+    names = known.shape
     if not names:
         return [{}]
     count = _STEPS[min(len(names), len(_STEPS)) - 1]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stagectl.effects import CATALOGUE, Effect
+from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import balance
 from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.command_path import driven
@@ -32,17 +32,6 @@ class Term:
     def key(self) -> tuple[str, str]:
         """What it is called and where it acts."""
         return self.name, self.acts_on
-
-
-AS_PARAMETERS = frozenset(
-    {
-        "mass_error",
-        "force_constant_error",
-        "contact_stiffness_error",
-        "backlash_width_change",
-    }
-)
-"""Effects that say the same as a known parameter that is wrong: `parameter_terms` has them."""
 
 
 def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
@@ -198,12 +187,12 @@ def effect_terms(recordings: Sequence[Recording], grids: dict[str, list[dict[str
     has_micro = all(r.end is not None for r in recordings)
     present = {(row["name"], row["acts_on"]) for row in recordings[0].believed.effects}
     for effect in CATALOGUE.values():
-        if "pitch_m" in effect.parameters or effect.name == "base_vibration":
+        if effect.period:
             continue  # searched by what stands out: `periodic_terms`
-        if effect.name in AS_PARAMETERS:
-            continue
+        if Trait.KNOWN_PARAMETER in effect.traits:
+            continue  # `parameter_terms` has them
         for place in effect.places:
-            if place == "micro_force" and effect.name in _ON_BOTH_AXES:
+            if place == "micro_force" and Trait.BASE in effect.traits:
                 continue
             if not has_micro and (not place.startswith("macro") or _needs_micro(effect)):
                 continue
@@ -219,15 +208,15 @@ def periodic_terms(
     recordings: Sequence[Recording], axis: str, pitches_m: list[float], frequencies_hz: list[float]
 ) -> Iterator[Term]:
     """Yield the effects that have a pitch or a frequency, at those that stand out."""
-    force = "macro_force" if axis == "macro" else "micro_force"
+    side = "macro" if axis == "macro" else "micro"
+    found = {"pitch_m": pitches_m, "frequency_hz": frequencies_hz, "": []}
     for effect in CATALOGUE.values():
+        if effect.origin and effect.name not in recordings[0].believed.own_effects:
+            continue  # of another profile in this process
         for place in effect.places:
-            if not place.startswith(force.removesuffix("_force")):
+            if not place.startswith(side) or (place == "micro_force" and Trait.BASE in effect.traits):
                 continue
-            if "pitch_m" in effect.parameters:
-                yield from (term_of(effect, place, {"pitch_m": pitch}) for pitch in pitches_m)
-            elif effect.name == "base_vibration" and place == "macro_force":
-                yield from (term_of(effect, place, {"frequency_hz": f}) for f in frequencies_hz)
+            yield from (term_of(effect, place, {effect.period: value}) for value in found[effect.period])
 
 
 def _needs_micro(effect: Effect) -> bool:
@@ -306,14 +295,12 @@ def deviation_term(effect: Effect, place: str, parameters: dict[str, float]) -> 
 
 
 _SHARE_BOUNDS = (0.0, 3.0)
-_ON_BOTH_AXES = ("gravity_tilt", "base_vibration")
-"""What a base does is felt by everything that stands on it."""
 
 
 def _everywhere(r: Recording, effect: Effect, place: str, values: list[float], *, whole: bool = False) -> Forces:
     """Evaluate an effect at its place; one of the base on both bodies."""
     forces = balance.effect_forces(r, effect, place, values, whole=whole)
-    if effect.name in _ON_BOTH_AXES and r.end is not None:
+    if Trait.BASE in effect.traits and r.end is not None:
         balance.add(forces, balance.effect_forces(r, effect, "micro_force", values))
     return forces
 

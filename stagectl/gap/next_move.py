@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stagectl.effects import CATALOGUE
 from stagectl.gap import hypotheses, prediction
 from stagectl.gap.balance import channels
 from stagectl.gap.believed import Believed
@@ -18,50 +19,16 @@ from stagectl.gap.moves import Move
 from stagectl.gap.planned import planned_log
 from stagectl.gap.prediction import DETECTED, Evidence, Expected
 
-_LOW_SPEED = ("slow reversals", "creep")
-_STROKES = ("slow stroke", "middle stroke", "fast stroke")
-_ACCELERATED = ("fast stroke", "sine 0.3 Hz", "sine 1 Hz", "sine 3 Hz")
-_HOLDS = ("holds at several places", "slow stroke", "middle stroke")
-_TOUCH = ("sweep over both edges",)
-_LONG = ("one minute of strokes",)
-
-SUITED: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(
-        (
-            "coulomb_friction",
-            "asymmetric_coulomb_friction",
-            "stribeck_friction",
-            "sublinear_viscous_friction",
-            "dahl_friction",
-            "lugre_friction",
-        ),
-        _LOW_SPEED,
-    ),
-    **dict.fromkeys(
-        ("viscous_friction", "asymmetric_viscous_friction", "quadratic_drag", "position_dependent_friction"), _STROKES
-    ),
-    **dict.fromkeys(("cogging", "cyclic_error", "scale_error", "abbe_error"), _STROKES),
-    **dict.fromkeys(
-        (
-            "current_ripple",
-            "load_dependent_friction",
-            "force_constant_saturation",
-            "micro_reaction",
-            "current_loop_lag",
-            "command_delay",
-            "sensor_delay",
-            "sensor_lag",
-            "flexible_mode",
-        ),
-        _ACCELERATED,
-    ),
-    **dict.fromkeys(("cable_spring", "cable_hysteresis", "gravity_tilt", "offset", "linear_stiffness"), _HOLDS),
-    **dict.fromkeys(
-        ("contact_damping", "contact_hysteresis", "soft_contact", "backlash_wear", "backlash_centre_shift"), _TOUCH
-    ),
-    **dict.fromkeys(("thermal_drift", "clock_skew"), _LONG),
+MOVES: dict[str, tuple[str, ...]] = {
+    "low speed": ("slow reversals", "creep"),
+    "strokes": ("slow stroke", "middle stroke", "fast stroke"),
+    "acceleration": ("fast stroke", "sine 0.3 Hz", "sine 1 Hz", "sine 3 Hz"),
+    "holds": ("holds at several places", "slow stroke", "middle stroke"),
+    "contact": ("sweep over both edges",),
+    "time": ("one minute of strokes",),
+    "": (),
 }
-"""By effect the moves that excite it, by name; effects that are not in it are asked of the whole library."""
+"""By the kind of motion that an effect is shown by, the moves of that kind; "": the whole library is asked."""
 
 _NEVER_APART = DETECTED  # d' below which a name is out of reach of every move of the library
 
@@ -102,7 +69,7 @@ def proposals(seen: Evidence, moves: Sequence[Move]) -> list[Proposal]:
             continue
         keys = {(name, place) for _, one, _ in rows for name, place, _ in one.separations}
         apart = {key for key in keys if max(_distance(one, (key,)) for _, one, _ in rows) >= _NEVER_APART}
-        suited = [row for row in rows if row[0].name in SUITED.get(effect.name, ())]
+        suited = [row for row in rows if row[0].name in MOVES[CATALOGUE[effect.name].shown_by]]
         deciding = [row for row in suited if _distance(row[1], tuple(apart)) >= DETECTED and row[1].decides]
         move, one, everything = max(deciding or rows, key=lambda row: _distance(row[1], tuple(apart)))
         found.append(

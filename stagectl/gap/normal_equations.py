@@ -28,7 +28,7 @@ class Sums:
 class Group:
     """Columns that stay or go together; `prior_sds` says how far each amplitude may be from zero, inf = any."""
 
-    key: object
+    key: tuple[str, str]  # what it is called and where it acts
     columns: tuple[int, ...]
     scope: str = "structural"  # structural | session | run: how far its amplitudes reach
     prior_sds: tuple[float, ...] = ()

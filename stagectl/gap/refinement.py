@@ -11,13 +11,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from stagectl.effects import CATALOGUE
+from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.grids import free_shapes
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Sums, active_slots, covers, normal_of
-from stagectl.gap.selection import LATE_READINGS
 
 _SWEEPS = 2
 _BRACKET = 2.2  # from the grid's place, up and down
@@ -68,7 +67,8 @@ class Refiner:
             for name in free:
                 shape, best = self._line(term, shape, name, best, 2.0 if entire and not sweep else 0.4**sweep)
         found = _with_shape(term, shape)
-        if found.name in LATE_READINGS and not found.linear:  # what a latch may be off by is no effect of a sensor
+        if Trait.LATE_READING in CATALOGUE[found.name].traits and not found.linear:
+            # what a latch may be off by is no effect of a sensor
             stated_s = _LATCH_SDS * self._evidence.recordings[0].belief(_axis(found)).latch_sd_s
             least = stated_s / shape[CATALOGUE[found.name].parameters[0]]
             found = replace(found, bounds=((max(found.bounds[0][0], least), found.bounds[0][1]),))
@@ -121,7 +121,7 @@ class Refiner:
             span = max(float(np.ptp(r.position_m(_axis(term)))) for r in self._evidence.recordings)
             reach = narrow * _PITCH_SPANS * at * at / span
             low, high = max(low, at - reach), min(high, at + reach)
-        elif name == "frequency_hz" and effect.name == "base_vibration":
+        elif name == effect.period == "frequency_hz":
             reach = narrow * 0.5 / max(r.log.samples_count * r.log.period_s for r in self._evidence.recordings)
             low, high = max(low, at - reach), min(high, at + reach)
         elif name == "anchor_m":
@@ -205,7 +205,9 @@ def whole_of(term: Term) -> bool:
     if term.acts_on == "parameter":
         return False
     effect = CATALOGUE[term.name]
-    moves = term.acts_on == "contact_edge" or (term.acts_on.endswith("_sensor") and term.name != "cyclic_error")
+    moves = term.acts_on == "contact_edge" or (
+        term.acts_on.endswith("_sensor") and Trait.FIRST_ORDER not in effect.traits
+    )
     return moves or not effect.linear
 
 

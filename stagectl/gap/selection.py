@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap.normal_equations import Fold, Group, Sums, held_out_gain, solve, within_bounds
 
 NULL_QUANTILE = 0.99
@@ -22,7 +23,7 @@ SEARCH_PRICE = 2.0
 
 NAMING_RATIO = 1.75
 """Of what the best of the library gains on noise, what a name has to gain. Columns are not as exact as noise is white:
-on development sets in which nothing was missing the best one gained up to 1.3 times the quantile, and an effect at twice
+on development sets in which nothing was missing the best one gained up to 1.3 times the quantile; an effect at twice
 its detection limit (d' = 10) gains four times as much."""
 
 RIVALS_COUNT = 6
@@ -32,10 +33,9 @@ ALIAS_GAIN = 8.6
 """Log-likelihood ratio (twice) below which two names can't be told apart: power 0.9 at 5 % false alarms."""
 
 ALIAS_SHARE = 0.002
-LATE_READINGS = frozenset({"sensor_delay", "sensor_lag"})
 LATE_SHARE = 0.12
-"""Late readings and prompt commands disagree on the velocity that both laws are made of: a lag of 0.45 ms at d' 45 lost
-a tenth of its gain to a delay."""
+"""The share between two late readings: beside prompt commands they disagree on the velocity that both laws are made of,
+and a lag of 0.45 ms at d' 45 lost a tenth of its gain to a delay."""
 
 
 class Source(Protocol):
@@ -120,7 +120,7 @@ class Judge:
         Ends early with a hypothesis of which `until` says that everything has to be looked at anew.
         """
         chosen = self._admissible(start)
-        seen: set[frozenset[object]] = set()
+        seen: set[frozenset[tuple[str, str]]] = set()
         while len(chosen) < most:
             rivals = self.rivals(chosen)
             passing = [group for group in rivals if self._stays(chosen, group) and self._allowed([*chosen, group])]
@@ -145,7 +145,7 @@ class Judge:
     def _ranked(self, chosen: Sequence[Group], most: int) -> list[Group]:
         """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
         fold = Fold([*self.base, *chosen], self.source.sums, self.source.sums, on_noise=False)
-        best: dict[object, tuple[float, Group]] = {}
+        best: dict[tuple[str, str], tuple[float, Group]] = {}
         taken = {group.key for group in chosen}
         at_size = self.gain_at_size([*self.base, *chosen])
         for group in self.library:
@@ -241,18 +241,23 @@ class Judge:
             chosen = rest
         return chosen
 
-    def aliases(self, chosen: Sequence[Group], group: Group) -> list[tuple[object, float]]:
+    def aliases(self, chosen: Sequence[Group], group: Group) -> list[tuple[tuple[str, str], float]]:
         """Return the keys that would do as well as `group` beside the others, with the margin that they lose by."""
         rest = [other for other in chosen if other is not group]
         with_it = self.gain(chosen)
         gained = with_it - self.gain(rest)
-        margins: dict[object, float] = {}
+        margins: dict[tuple[str, str], float] = {}
         taken = {other.key for other in chosen}
         for other in self.rivals(rest):
             if other.key in taken or other.complexity > group.complexity or not self._allowed([*rest, other]):
                 continue
             margin = with_it - self.gain([*rest, other])
-            late = {str(key[0]) for key in (group.key, other.key)} <= LATE_READINGS  # pyright: ignore[reportIndexIssue]
+            late = _is_late_reading(group) and _is_late_reading(other)
             if margin < ALIAS_GAIN + (LATE_SHARE if late else ALIAS_SHARE) * gained:
                 margins[other.key] = margin
         return sorted(margins.items(), key=lambda row: row[1])
+
+
+def _is_late_reading(group: Group) -> bool:
+    known = CATALOGUE.get(group.key[0])
+    return known is not None and Trait.LATE_READING in known.traits

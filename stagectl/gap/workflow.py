@@ -117,7 +117,7 @@ def _all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
                 sds=errors,
                 gain=whole[0] - rest[0],
                 held_out_gain=whole[1] - rest[1],
-                aliases=tuple((*key, margin) for key, margin in judge.aliases(chosen, group)),  # pyright: ignore[reportGeneralTypeIssues]
+                aliases=tuple((*key, margin) for key, margin in judge.aliases(chosen, group)),
             )
         )
     return tuple(found)
@@ -169,7 +169,7 @@ def _parameter_errors(search: Competition, chosen: list[Group], solution: Soluti
         if term.acts_on == "parameter":
             values, sds = solution.of(group)
             own = stated.get(term.name, stated.get(_PART_OF.get(term.name, ""), 0.0))
-            aliases = tuple(str(key[0]) for key, _ in search.judge.aliases(chosen, group) if key[1] == "parameter")  # pyright: ignore[reportIndexIssue]
+            aliases = tuple(key[0] for key, _ in search.judge.aliases(chosen, group) if key[1] == "parameter")
             found.append(ParameterError(term.name, float(values[0]), float(sds[0]), own, aliases))
     return tuple(found)
 
