@@ -780,6 +780,23 @@ def test_an_interrupt_is_heard_where_nothing_is_half_done(capsys, tmp_path, numb
     assert signal.getsignal(number) is before
 
 
+def test_an_interrupt_says_what_is_whole(capsys, tmp_path):
+    """Findings that were written stay, also where the page beside them was not drawn."""
+    kept = tmp_path / "findings.json"
+
+    def work(voice):
+        kept.write_text("{}")
+        voice.whole_file = kept
+        os.kill(os.getpid(), signal.SIGINT)
+        voice.progress("drawing the page", 0.0)
+
+    with pytest.raises(cli.typer.Exit):
+        deliver("test", True, work)
+    said = capsys.readouterr()
+    assert json.loads(said.out)["error"]["message"] == f"{kept} is whole, what was to follow is not there"
+    assert "nothing was recorded" not in said.err
+
+
 def test_nothing_interrupts_the_way_to_rest(capsys):
     def work(voice):
         voice.hush()

@@ -14,7 +14,7 @@ from stagectl.commands.opening import home_and_arm
 from stagectl.errors import RequestError
 from stagectl.gap import moves, next_move, prediction
 from stagectl.gap.believed import load_believed
-from stagectl.gap.findings import Findings, Named
+from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import log_of_rows, read_log
 from stagectl.gap.planned import planned_log
@@ -164,6 +164,53 @@ def test_planned_commands_leave_no_gap(stage, settled):
     recording = prediction.prepared(planned_log(stage[1]["middle stroke"].trajectory, believed), believed)
     z = prediction.observed(recording)
     assert np.sqrt(np.mean(z * z)) < 1.0
+
+
+@pytest.fixture(scope="module")
+def unseen_sine(stage):
+    """Rows of an accelerated move that no fit saw."""
+    folder, done = stage[2]("sine 1 Hz", seed=8)
+    return read_run(folder).rows[done.first_row : done.first_row + done.rows]
+
+
+def test_a_wrong_parameter_is_predicted_and_judged_like_an_effect(stage, settled, unseen_sine):
+    """The mass is believed too small: a run that nobody saw shows the error as found, and neither twice nor minus it.
+
+    To first order, as findings state it, 15 % more mass make the same forces 1 - 1 / 1.15 less of an acceleration. An
+    error of 5 % would decide nothing: on one axis a force constant that is 1 % uncertain hides a fifth of it.
+    """
+    believed, logs, runs, _ = settled
+    light = replace(believed, macro=replace(believed.macro, mass_kg=believed.macro.mass_kg / 1.15))
+    true = 1.0 - 1.0 / 1.15
+    friction = replace(
+        COULOMB, parameters={**COULOMB.parameters, "level_n": LEVEL_N * (1.0 - true)}
+    )  # fitted beside it
+    sine = stage[1]["sine 1 Hz"]
+    unseen = log_of_rows(unseen_sine, "unseen", believed.period_s, "unseen", imported=False, believed=light)
+    for error, held in ((true, True), (2.0 * true, False), (-true, False)):
+        wrong = ParameterError("macro_mass_kg", error, 1e-3, 0.01)
+        findings = replace(findings_of((friction,), runs), parameter_errors=(wrong,), refitted={"macro_mass_kg": error})
+        seen = prediction.evidence(light, logs, findings)
+        expected = prediction.expected(seen, planned_log(sine.trajectory, light))
+        assert [(one.name, one.acts_on) for one in expected][1:] == [("macro_mass_kg", "parameter")]
+        assert expected[1].decides or not held
+        outcome = prediction.judged(seen, unseen, expected)[1]
+        assert outcome.confirmed is held, outcome
+        after = prediction.with_outcomes(findings, [outcome])
+        assert after.parameter_errors[0].confirmed is held
+        assert not after.named[0].confirmed  # of which this outcome says nothing
+
+
+def test_parameters_alone_are_something_to_confirm(stage, settled):
+    believed, logs, runs, _ = settled
+    wrong = ParameterError("macro_mass_kg", 0.05, 1e-3, 0.01)
+    light = replace(believed, macro=replace(believed.macro, mass_kg=believed.macro.mass_kg / 1.05))
+    alone = replace(findings_of((), runs), parameter_errors=(wrong,), refitted={"macro_mass_kg": 0.05})
+    seen = prediction.evidence(light, logs, alone)
+    (proposal,) = next_move.proposals(seen, [stage[1][name] for name in ("creep", "sine 3 Hz")])
+    assert (proposal.name, proposal.move.name) == ("macro_mass_kg", "sine 3 Hz")
+    with pytest.raises(RequestError, match="name no effect"):
+        prediction.evidence(light, logs, replace(alone, unknown={"over": "t_s"}))
 
 
 def test_nothing_named_is_nothing_to_predict(settled):

@@ -45,6 +45,7 @@ class Voice:
     progress: LiveProgress
     hush: Callable[[], None]  # from here on no signal interrupts
     run_folder: Path | None = field(default=None)
+    whole_file: Path | None = field(default=None)  # a result that is there whatever comes after
 
     def note(self, text: str) -> None:
         """Say a sentence on stderr."""
@@ -146,7 +147,10 @@ def _say_error(
 
 def _say_interrupted(command: str, as_json: bool, console: Console, voice: Voice) -> None:
     run = _existing_run(voice)
+    kept = voice.whole_file
     moved = "the stage was brought to rest and the run closed" if run is not None else "nothing was recorded"
+    if kept is not None:
+        moved = f"{moved}; {kept} is whole" if run is not None else f"{kept} is whole, what was to follow is not there"
     console.print(f"[bold yellow]interrupted[/]: {moved}", highlight=False)
     if run is not None:
         voice.note(f"the run up to here: {run}")

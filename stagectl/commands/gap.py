@@ -13,7 +13,7 @@ from stagectl.commands.answer import Answer, Voice
 from stagectl.commands.profiles import check_eds
 from stagectl.commands.runs import folder_of
 from stagectl.errors import ProfileError, RequestError
-from stagectl.gap import addition, arbiter, findings_page, plausibility, residual
+from stagectl.gap import addition, arbiter, findings_page, residual
 from stagectl.gap.application import Application, Change, application
 from stagectl.gap.believed import Believed, document_of, load_believed
 from stagectl.gap.findings import Findings, Named
@@ -33,15 +33,13 @@ def search(
     believed = load_believed(profile)
     logs = [_log(run, runs_root, believed) for run in training]
     apart = [_log(run, runs_root, believed) for run in held]
-    voice.progress("checking the recordings", 0.0)
-    for remark in plausibility.check(believed, logs, apart):
-        voice.warn(remark)
     findings = find(believed, logs, apart, seed=seed, say=lambda step: voice.progress(step, 0.0))
     voice.progress.done()
     for remark in findings.remarks:
         voice.note(remark)
     out.mkdir(parents=True, exist_ok=True)
     write_findings(findings, out / FINDINGS)
+    voice.whole_file = out / FINDINGS
     ladder = _ladder(believed, findings, [*logs, *apart], voice)
     voice.progress("drawing the page", 0.0)
     residuals = residual.residuals(believed, findings, logs, apart)

@@ -140,7 +140,7 @@ def show(voice: Voice, profile: str, runs_root: Path, seed: int) -> Answer:
     shown: list = [_secret(hidden), f"found   {names}", judged_table(outcomes, chosen.expected)]
     if not any(one.confirmed for one in outcomes):
         return Answer(data, [*shown, "nothing was confirmed: the profile stays", f"files   {folder}"], ENDED_EARLY)
-    done = application(path.read_text(), found, candidates=False, date=date.today().isoformat())
+    done = application(path.read_bytes().decode(), found, candidates=False, date=date.today().isoformat())
     replace_whole(folder / PROFILE, done.text.encode())
     better = _Rig(load_profile(folder / PROFILE), machine, folder, voice, seed)
     error_after_m = better.follows(by_name[FOLLOWED])[1]

@@ -16,7 +16,7 @@ from stagectl.commands.runs import folder_of
 from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import moves, next_move, prediction
 from stagectl.gap.believed import Believed, load_believed
-from stagectl.gap.findings import Findings
+from stagectl.gap.findings import Findings, title_of
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import Log, log_of_rows, read_log
 from stagectl.gap.moves import Move
@@ -40,11 +40,16 @@ def show(
     found = read_findings(file)
     name = profile if profile is not None else _profile_of(found, runs_root)
     believed = load_believed(name)
+    if found.profile_sha256 and believed.sha256 != found.profile_sha256:
+        raise RequestError(
+            f"{believed.path} has changed since the findings were made (sha256 {believed.sha256[:12]}, then "
+            f"{found.profile_sha256[:12]}): give the file of that time with --profile, or run `stagectl gap` again"
+        )
     voice.note("reading the recordings of the findings")
     logs = [read_log(folder_of(run, runs_root), believed.period_s, believed) for run in (*found.runs, *found.holdout)]
     candidates = _library(name, believed, logs)
     shown: list = [_excited_table(next_move.excitations(believed, found, candidates))] if found.not_excited else []
-    if not found.named:
+    if not found.named and (found.unknown is not None or not found.parameter_errors):
         return Answer({"proposals": []}, [*shown, "No effect is named: there is nothing to confirm."])
     seen = prediction.evidence(believed, logs, found)
     proposals = next_move.proposals(seen, candidates)
@@ -59,7 +64,7 @@ def show(
         return Answer(data, [*shown, "[dim]`--run` does it on the stage, and judges[/]"])
     if not chosen.decides:
         raise RequestError(
-            f"{chosen.move.name}, the best move for {chosen.name} on {chosen.acts_on}, shows it with "
+            f"{chosen.move.name}, the best move for {title_of(chosen.name, chosen.acts_on)}, shows it with "
             f"d' {chosen.d_prime:.1f}, {prediction.DETECTED:g} is needed; record longer, with other payloads or gains"
         )
     where = place(name, backend, runs_root, seed)
@@ -93,7 +98,9 @@ def perform(seen: Evidence, chosen: Proposal, profile: Profile, stage: Stage) ->
 
 
 def _profile_of(found: Findings, runs_root: Path) -> str:
-    """Return where the profile of the findings is: its name, or the file that the first run was made with."""
+    """Return where the profile of the findings is: its file, its name, or the file that the first run was made with."""
+    if found.profile_path and Path(found.profile_path).exists():
+        return found.profile_path
     try:
         load_believed(found.profile)
     except ProfileError:
@@ -154,7 +161,7 @@ def _proposed(proposals: Sequence[Proposal]) -> list:
         mine = next(e for e in one.expected if (e.name, e.acts_on) == (one.name, one.acts_on))
         low, high = mine.fall_interval
         table.add_row(
-            f"{one.name} on {one.acts_on}",
+            title_of(one.name, one.acts_on),
             one.move.name,
             f"{one.move.trajectory.duration_s:.0f} s",
             ", ".join(f"{name} on {where}" for name, where in one.against) or "nothing at all",
@@ -177,7 +184,7 @@ def judged_table(outcomes: Sequence[Outcome], expected: Sequence[Expected]) -> T
         mine = by_key[one.name, one.acts_on]
         low, high = mine.fall_interval
         table.add_row(
-            f"{one.name} on {one.acts_on}",
+            title_of(one.name, one.acts_on),
             _size(one.gap_before, one.unit),
             _size(one.gap_after, one.unit),
             _size(one.fall, one.unit),
@@ -188,7 +195,7 @@ def judged_table(outcomes: Sequence[Outcome], expected: Sequence[Expected]) -> T
 
 
 def _verdict(one: Outcome) -> str:
-    title = f"{one.name} on {one.acts_on}"
+    title = title_of(one.name, one.acts_on)
     if one.confirmed:
         gone = ", ".join(name for name, _, _ in one.out)
         return f"{title}: confirmed: the prediction held" + (f"; ruled out: {gone}" if gone else "")

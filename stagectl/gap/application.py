@@ -3,12 +3,13 @@
 Every written value carries a comment with its 95 % interval; one line on top says from which runs. Pure.
 """
 
+import hashlib
 import itertools
 import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any
 
@@ -21,7 +22,7 @@ from stagectl.effects.table import KNOTS_COUNT, TABLES
 from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import addition
 from stagectl.gap.findings import Findings, Named, ParameterError
-from stagectl.gap.hypotheses import phase_of
+from stagectl.gap.hypotheses import parts_of, phase_of
 
 _SIGMAS = 1.96  # of a 95 % interval
 _LEAST_RATIO = 1e-3  # effects of the profile that were refitted by less stay as they are
@@ -97,15 +98,18 @@ def application(document_text: str, findings: Findings, *, candidates: bool, dat
     _refuse_damaged(findings)
     _refuse_other_profile(document, findings, _origin(findings), document_text)
     sheet = _Sheet(document, _mark(document_text, date))
-    whole = bool(findings.named) and all(effect.confirmed for effect in findings.named)
+    targets = (*findings.named, *findings.parameter_errors)
+    whole = bool(targets) and all(target.confirmed for target in targets)
     for effect in findings.named:
         if effect.confirmed or candidates:
             _write_effect(sheet, effect)
-    if whole or candidates:
-        # a prediction that held was that of the whole model: it confirms the parameters that were fitted with it
-        for error in _parameters_of_keys(sheet, findings):
-            _write_parameter(sheet, error, whole)
-        _write_refitted(sheet, findings, whole)
+    for error in _parameters_of_keys(sheet, findings):
+        if error.confirmed or candidates:
+            _write_parameter(sheet, error)
+        else:
+            sheet.left.append(f"{error.name} is off by {error.error:.3g}, not confirmed: --candidates writes it")
+    # what was fitted together holds together: a prediction that held was that of the whole model
+    _write_refitted(sheet, findings, whole, candidates)
     if findings.unknown is not None:
         if candidates:
             _write_table(sheet, findings.unknown)
@@ -279,7 +283,9 @@ def _natural(text: str) -> list[tuple[int, int, str]]:
 def _parameters_of_keys(sheet: _Sheet, findings: Findings) -> Iterator[ParameterError]:
     """Yield the parameter errors of keys; the latch of both axes is one key, so they must agree."""
     latches = [error for error in findings.parameter_errors if error.name in _LATCHES]
-    yield from (error for error in findings.parameter_errors if error not in latches and " on " not in error.name)
+    for error in findings.parameter_errors:
+        if error not in latches and " on " not in error.name:
+            yield from (replace(error, name=part) for part in parts_of(error.name))
     if not latches:
         return
     sharing = sum(name in findings.refitted for name in _LATCHES)
@@ -297,13 +303,14 @@ def _parameters_of_keys(sheet: _Sheet, findings: Findings) -> Iterator[Parameter
         sheet.left.append(f"{both}: they differ, and the profile has one delay for both; write command_delay by hand")
         return
     mean = sum(w * error.error for w, error in zip(weights, latches, strict=True)) / sum(weights)
-    yield ParameterError(_LATCHES[0], mean, sum(weights) ** -0.5, latches[0].stated_sd)
+    confirmed = all(error.confirmed for error in latches)
+    yield ParameterError(_LATCHES[0], mean, sum(weights) ** -0.5, latches[0].stated_sd, confirmed=confirmed)
 
 
-def _write_parameter(sheet: _Sheet, error: ParameterError, confirmed: bool) -> None:
+def _write_parameter(sheet: _Sheet, error: ParameterError) -> None:
     """Correct one known parameter."""
     if error.name in _FORCE_CONSTANTS:
-        _write_force_constant(sheet, error, _FORCE_CONSTANTS[error.name], confirmed)
+        _write_force_constant(sheet, error, _FORCE_CONSTANTS[error.name])
         return
     if error.name in _LATCHES:
         cycle = sheet.document.get("cycle", {})
@@ -319,25 +326,31 @@ def _write_parameter(sheet: _Sheet, error: ParameterError, confirmed: bool) -> N
     scale = before if place.is_ratio else 1.0
     value = before + scale * error.error
     half_width = _SIGMAS * abs(scale) * error.sd
-    sheet.set(table, place.key, Change(f"{place.table}.{place.key}", value, before, half_width, confirmed))
+    change = Change(f"{place.table}.{place.key}", value, before, half_width, error.confirmed, _instead(error))
+    sheet.set(table, place.key, change)
 
 
-def _write_force_constant(sheet: _Sheet, error: ParameterError, acts_on: str, confirmed: bool) -> None:
+def _instead(error: ParameterError) -> str:
+    return "explained as well by " + ", ".join(error.aliases) if error.aliases else ""
+
+
+def _write_force_constant(sheet: _Sheet, error: ParameterError, acts_on: str) -> None:
+    confirmed, remark = error.confirmed, _instead(error)
     half_width = _SIGMAS * error.sd
     for number, row in enumerate(sheet.effects):
         if (row["name"], row["acts_on"]) == ("force_constant_error", acts_on):
             before = float(row["error_ratio"])
-            change = Change(f"effects[{number}].error_ratio", before + error.error, before, half_width, confirmed)
-            sheet.set(row, "error_ratio", change)
+            key, value = f"effects[{number}].error_ratio", before + error.error
+            sheet.set(row, "error_ratio", Change(key, value, before, half_width, confirmed, remark))
             return
     state = "confirmed" if confirmed else "candidate, not confirmed yet"
     key, table = sheet.add_effect(f"{sheet.mark}: {state}; rated_force_n stays the drive's name plate")
     table["name"] = "force_constant_error"
     table["acts_on"] = acts_on
-    sheet.set(table, "error_ratio", Change(f"{key}.error_ratio", error.error, None, half_width, confirmed))
+    sheet.set(table, "error_ratio", Change(f"{key}.error_ratio", error.error, None, half_width, confirmed, remark))
 
 
-def _write_refitted(sheet: _Sheet, findings: Findings, confirmed: bool) -> None:
+def _write_refitted(sheet: _Sheet, findings: Findings, whole: bool, candidates: bool) -> None:
     """Replace the amplitudes of the profile's own effects by those that were fitted together with what was found."""
     errors = {error.name: error for error in findings.parameter_errors}
     for number, row in enumerate(sheet.effects):
@@ -345,6 +358,11 @@ def _write_refitted(sheet: _Sheet, findings: Findings, confirmed: bool) -> None:
         ratio = findings.refitted.get(title, 0.0)
         error = errors.get(title)
         if abs(ratio) < _LEAST_RATIO and error is None:
+            continue
+        confirmed = whole or (error is not None and error.confirmed)
+        if not confirmed and not candidates:
+            if error is not None:
+                sheet.left.append(f"{title} is off by {ratio:.3g}, not confirmed: --candidates writes it")
             continue
         if f"effects[{number}]" in {change.key.partition(".")[0] for change in sheet.written}:
             continue  # added above, or corrected as a force constant
@@ -359,10 +377,12 @@ def _write_refitted(sheet: _Sheet, findings: Findings, confirmed: bool) -> None:
             said = f"{outside[0]} = {values[outside[0]]:.4g} is outside {low:g} to {high:g}"
             sheet.left.append(f"{title}: refitted, its {said}; is the effect there at all?")
             continue
-        remark = "" if error is not None else "refitted with what was found, no interval"
+        sd = error.sd if error is not None else findings.refitted_sds.get(title)
+        remark = "" if error is not None else "refitted with what was found"
+        remark += "" if sd is not None else ", no interval"
         for name, value in values.items():
             before = float(row[name])
-            half_width = None if error is None else _SIGMAS * error.sd * abs(before)
+            half_width = None if sd is None else _SIGMAS * sd * abs(before)
             sheet.set(row, name, Change(f"effects[{number}].{name}", value, before, half_width, confirmed, remark))
 
 
@@ -430,6 +450,12 @@ def _refuse_other_profile(document: Mapping[str, Any], findings: Findings, origi
             f"profile {name} has changed since the findings were made ({odd}): give the profile of that time, or run "
             "`stagectl gap` again"
         )
+    now = hashlib.sha256(text.encode()).hexdigest()
+    if findings.profile_sha256 not in ("", now):
+        raise RequestError(
+            f"profile {name} has changed since the findings were made (sha256 {now[:12]}, then "
+            f"{findings.profile_sha256[:12]}): give the profile of that time, or run `stagectl gap` again"
+        )
 
 
 def _refuse_damaged(findings: Findings) -> None:
@@ -448,14 +474,15 @@ def _refuse_damaged(findings: Findings) -> None:
                 problem = f"{effect.name} on {effect.acts_on} has not its parameters: {odd}"
             elif not _are_numbers([*effect.parameters.values(), *effect.sds.values()]):
                 problem = f"{effect.name} on {effect.acts_on} has values that are no numbers"
+    known_names = {*_PLACES, *_FORCE_CONSTANTS, *_LATCHES, *findings.refitted}
     for error in findings.parameter_errors:
-        if error.name not in {*_PLACES, *_FORCE_CONSTANTS, *_LATCHES} and error.name not in findings.refitted:
-            problem = f"{error.name} is no parameter"
+        if strange := [part for part in parts_of(error.name) if part not in known_names]:
+            problem = f"{strange[0]} is no parameter"
         elif not _are_numbers([error.error, error.sd]):
             problem = f"{error.name} has values that are no numbers"
     if findings.unknown is not None and (said := _curve_problem(findings.unknown)):
         problem = f"the unknown curve {said}"
-    if not _are_numbers(list(findings.refitted.values())):
+    if not _are_numbers([*findings.refitted.values(), *findings.refitted_sds.values()]):
         problem = "refitted values that are no numbers"
     if problem:
         raise RequestError(f"the findings are damaged or of another version: {problem}; run `stagectl gap` again")

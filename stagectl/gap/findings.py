@@ -3,6 +3,13 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+PARAMETER = "parameter"
+
+
+def title_of(name: str, acts_on: str) -> str:
+    """Say what a finding is about."""
+    return f"{name} (known parameter)" if acts_on == PARAMETER else f"{name} on {acts_on}"
+
 
 @dataclass(frozen=True, slots=True)
 class Named:
@@ -23,10 +30,16 @@ class ParameterError:
     """A known parameter that the recordings contradict."""
 
     name: str
-    error: float  # ratio, or metres for an edge
+    error: float  # ratio, metres for an edge, or seconds for a time
     sd: float
     stated_sd: float
     aliases: tuple[str, ...] = ()  # parameters that would do as well
+    confirmed: bool = False
+
+    @property
+    def acts_on(self) -> str:
+        """Where predictions and outcomes say that it acts: it has no place of its own."""
+        return PARAMETER
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +52,14 @@ class Findings:
     verdict: str  # nothing | found | unknown
     named: tuple[Named, ...]
     parameter_errors: tuple[ParameterError, ...]
-    refitted: dict[str, float]  # every known parameter's error as fitted: a ratio, or metres for an edge
+    refitted: dict[str, float]  # every known parameter's error as fitted: a ratio, or in its own unit
     not_excited: tuple[str, ...]
     unknown: dict[str, Any] | None
     reducible_before: tuple[float, float]
     reducible_after: tuple[float, float]
     threshold: float
     remarks: tuple[str, ...] = ()
-    trace: tuple[str, ...] = field(default=())
+    trace: tuple[str, ...] = ()
+    refitted_sds: dict[str, float] = field(default_factory=dict)  # absent from findings of older versions
+    profile_path: str = ""  # "" where the belief came from no file
+    profile_sha256: str = ""

@@ -32,7 +32,9 @@ def read_findings(path: Path) -> Findings:
         content["named"] = tuple(
             Named(**{**row, "aliases": tuple(tuple(alias) for alias in row["aliases"])}) for row in content["named"]
         )
-        content["parameter_errors"] = tuple(ParameterError(**row) for row in content["parameter_errors"])
+        content["parameter_errors"] = tuple(
+            ParameterError(**{**row, "aliases": tuple(row["aliases"])}) for row in content["parameter_errors"]
+        )
         lists = [name for name, value in content.items() if isinstance(value, list)]
         return Findings(**{**content, **{name: tuple(content[name]) for name in lists}})
     except OSError as error:

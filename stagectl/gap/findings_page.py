@@ -84,6 +84,7 @@ def _facts(findings: Findings, seed: int) -> list[tuple[str, str]]:
     held = ", ".join(Path(run).name for run in findings.holdout) or "none apart: each training run is held out once"
     return [
         ("Profile", findings.profile),
+        *([("Profile's hash", findings.profile_sha256[:12])] if findings.profile_sha256 else []),
         ("Training runs", ", ".join(Path(run).name for run in findings.runs)),
         ("Held-out runs", held),
         ("Seed", str(seed)),
@@ -156,7 +157,7 @@ def _grouped(value: float) -> str:
 def _parameter_table(errors: Sequence[ParameterError]) -> Table:
     rows: list[list[str | Quantity]] = [
         [
-            wrong.name,
+            f"{wrong.name}{'' if wrong.confirmed else ' (candidate)'}",
             _error_text(wrong.name, wrong.error, wrong.sd),
             _error_text(wrong.name, wrong.stated_sd),
             ", ".join(wrong.aliases) or "–",

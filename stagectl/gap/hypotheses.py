@@ -116,10 +116,7 @@ def wrong_parameter_terms(recording: Recording) -> Iterator[Term]:
     for name, term in terms.items():
         if not name.endswith(("_s", "_m")):
             yield free(name, term.forces, _WRONG_RATIO if not name.startswith(("contact_", "viscous_")) else 1.0)
-    for name, parts in (
-        ("contact_stiffness_n_per_m", ("left_stiffness_n_per_m", "right_stiffness_n_per_m")),
-        ("backlash_width_m", ("left_m", "right_m")),
-    ):
+    for name, parts in _BOTH_SIDES.items():
         if all(part in terms for part in parts):
 
             def both(r: Recording, parts: tuple[str, ...] = parts) -> list[Forces]:
@@ -129,6 +126,18 @@ def wrong_parameter_terms(recording: Recording) -> Iterator[Term]:
                 return [total]
 
             yield free(name, both, _WRONG_M if name.endswith("_m") else _WRONG_RATIO)
+
+
+_BOTH_SIDES = {
+    "contact_stiffness_n_per_m": ("left_stiffness_n_per_m", "right_stiffness_n_per_m"),
+    "backlash_width_m": ("left_m", "right_m"),
+}
+"""Known parameters that are wrong alike on both sides of the joint, as one hypothesis."""
+
+
+def parts_of(parameter: str) -> tuple[str, ...]:
+    """Return the known parameters that an error is of: itself, or both sides of the joint."""
+    return _BOTH_SIDES.get(parameter, (parameter,))
 
 
 def terms_unit(name: str) -> str:

@@ -13,7 +13,7 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap import hypotheses, prediction
 from stagectl.gap.balance import channels
 from stagectl.gap.believed import Believed
-from stagectl.gap.findings import Findings
+from stagectl.gap.findings import Findings, Named
 from stagectl.gap.grids import grids_for
 from stagectl.gap.moves import Move
 from stagectl.gap.planned import planned_log
@@ -53,28 +53,32 @@ class Proposal:
 
 
 def proposals(seen: Evidence, moves: Sequence[Move]) -> list[Proposal]:
-    """Return the best move for each effect that is not confirmed yet, or has aliases, in the order of the findings."""
+    """Return the best move for each finding that is open, in the order of the findings.
+
+    Open is what is not confirmed yet, and an effect with aliases: moves tell effects apart, parameters don't compete.
+    """
     by_move = [(move, prediction.expected(seen, planned_log(move.trajectory, seen.believed))) for move in moves]
     found = []
-    for effect in seen.named:
-        if effect.confirmed and not effect.aliases:
+    for target in seen.targets:
+        if target.confirmed and not (isinstance(target, Named) and target.aliases):
             continue
         rows = [
             (move, one, tuple(everything))
             for move, everything in by_move
             for one in everything
-            if (one.name, one.acts_on) == (effect.name, effect.acts_on)
+            if (one.name, one.acts_on) == (target.name, target.acts_on)
         ]
         if not rows:
             continue
         keys = {(name, place) for _, one, _ in rows for name, place, _ in one.separations}
         apart = {key for key in keys if max(_distance(one, (key,)) for _, one, _ in rows) >= _NEVER_APART}
-        suited = [row for row in rows if row[0].name in MOVES[CATALOGUE[effect.name].shown_by]]
+        shown_by = CATALOGUE[target.name].shown_by if isinstance(target, Named) else ""
+        suited = [row for row in rows if row[0].name in MOVES[shown_by]]
         deciding = [row for row in suited if _distance(row[1], tuple(apart)) >= DETECTED and row[1].decides]
         move, one, everything = max(deciding or rows, key=lambda row: _distance(row[1], tuple(apart)))
         found.append(
             Proposal(
-                move, effect.name, effect.acts_on, _distance(one, tuple(apart)), tuple(sorted(apart)), everything,
+                move, target.name, target.acts_on, _distance(one, tuple(apart)), tuple(sorted(apart)), everything,
                 tuple(sorted(keys - apart)),
             )
         )  # fmt: skip

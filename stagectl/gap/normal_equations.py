@@ -57,6 +57,13 @@ class Solution:
         places = [k for k, (column, _) in enumerate(self.slots) if column in group.columns]
         return self.values[places], np.sqrt(np.maximum(np.diag(self.covariance)[places], 0.0))
 
+    def total_of(self, groups: Sequence[Group]) -> tuple[float, float]:
+        """Return the sum of the first amplitudes of some groups, and its standard deviation."""
+        columns = {group.columns[0] for group in groups}
+        places = [k for k, (column, _) in enumerate(self.slots) if column in columns]
+        variance = float(self.covariance[np.ix_(places, places)].sum())
+        return float(self.values[places].sum()), float(np.sqrt(max(variance, 0.0)))
+
 
 def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
     """Solve the amplitudes of `groups` on all of `sums`."""

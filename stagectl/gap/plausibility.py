@@ -6,6 +6,7 @@ add; factors and shares are compared, so nothing depends on how large the missin
 bodies in recordings: `tests/blind` (development seeds 20 to 43), EMPS, rig runs; none of those is refused. Pure.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -27,6 +28,7 @@ _FACTOR_LIMIT = 3.0  # of one recording: 0.7 to 1.05
 _FACTOR_SDS = 20.0  # of all recordings together, in what is stated of mass and force constant
 _FACTOR_SIGMAS = 6.0
 _SWAP_RATIO = 0.25  # of the squares that are left
+_GOOD_RATIO = 0.02  # of the squares of the inertia force
 _SAME_RATIO = 0.5  # of the samples
 _NEAR = 3.0  # of a unit's factor: what follows velocity and position takes its share
 _SMOOTH_RATIO = 0.1
@@ -53,7 +55,8 @@ class _Balance:
     factor_sd: float
     explained_ratio: float
     weight: float
-    left: float  # square of inertia force minus modelled forces
+    whole: float  # square of inertia force
+    left: float  # of inertia force minus modelled forces
 
 
 def check(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> tuple[str, ...]:
@@ -61,6 +64,13 @@ def check(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> t
 
     Returns what is worth knowing of those that can.
     """
+    remarks = check_logs(believed, training, held)
+    check_recordings(believed, [balance.recording_of(log, believed) for log in [*training, *held]])
+    return remarks
+
+
+def check_logs(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> tuple[str, ...]:
+    """Refuse what can be seen in the columns alone; errors and values as of `check`."""
     logs = [*training, *held]
     remarks: list[str] = []
     for log in logs:
@@ -71,7 +81,11 @@ def check(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> t
     _check_moving(training, "training")
     if held:
         _check_moving(held, "held-out")
-    recordings = [balance.recording_of(log, believed) for log in logs]
+    return tuple(remarks)
+
+
+def check_recordings(believed: Believed, recordings: Sequence[Recording]) -> None:
+    """Refuse motions that the forces beside them don't make; errors as of `check`."""
     for recording in recordings:
         _check_reference(recording)
     balances = [_balance(recording, axis) for recording in recordings for axis in recording.axes]
@@ -80,7 +94,6 @@ def check(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> t
         _check_one(believed, one)
     for axis in recordings[0].axes:
         _check_all(believed, recordings[0], axis, [b for b in balances if b.axis == axis and b.accelerating])
-    return tuple(remarks)
 
 
 def _check_columns(log: Log) -> None:
@@ -92,9 +105,10 @@ def _check_columns(log: Log) -> None:
 def _check_different(training: Sequence[Log], held: Sequence[Log]) -> None:
     """Refuse one recording given twice, under whatever name: it would confirm itself."""
     logs = [*training, *held]
+    samples = [np.unique(log.macro_position_m + 1j * log.macro_command_n) for log in logs]
     for k, one in enumerate(logs):
         for number, other in enumerate(logs[:k]):
-            if _shared_ratio(one, other) > _SAME_RATIO:
+            if _shared_ratio(samples[k], samples[number]) > _SAME_RATIO:
                 sides = "training and holdout" if number < len(training) <= k else "one side"
                 raise RequestError(
                     f"{one.name} and {other.name} hold the same samples, both given as {sides}; a recording can't "
@@ -102,12 +116,9 @@ def _check_different(training: Sequence[Log], held: Sequence[Log]) -> None:
                 )
 
 
-def _shared_ratio(one: Log, other: Log) -> float:
+def _shared_ratio(one: np.ndarray, other: np.ndarray) -> float:
     """Return how many of the samples of the shorter of two recordings stand in the other as well."""
-    pairs = [np.unique(np.column_stack([log.macro_position_m, log.macro_command_n]), axis=0) for log in (one, other)]
-    shorter = min(len(pairs[0]), len(pairs[1]))
-    both = np.unique(np.concatenate(pairs), axis=0)
-    return (len(pairs[0]) + len(pairs[1]) - len(both)) / shorter
+    return np.intersect1d(one, other, assume_unique=True).size / min(one.size, other.size)
 
 
 def _check_moving(logs: Sequence[Log], side: str) -> None:
@@ -142,10 +153,15 @@ def _noise_m(position_m: np.ndarray) -> float:
 
 def _in_band(recording: Recording, values: np.ndarray) -> np.ndarray:
     h = recording.log.period_s
-    high_hz = min(_BAND_HZ[1], 0.2 / h)
-    sos = butter(4, np.array([_BAND_HZ[0], high_hz]) * 2.0 * h, btype="band", output="sos")
     edge = round(_EDGE_S / h)
-    return np.asarray(sosfiltfilt(sos, values))[edge:-edge]
+    return np.asarray(sosfiltfilt(_band_pass(h), values))[edge:-edge]
+
+
+@functools.cache
+def _band_pass(period_s: float) -> np.ndarray:
+    high_hz = min(_BAND_HZ[1], 0.2 / period_s)
+    band = np.array([_BAND_HZ[0], high_hz]) * 2.0 * period_s
+    return np.asarray(butter(4, band, btype="band", output="sos"))
 
 
 def _balance(recording: Recording, axis: str) -> _Balance:
@@ -174,6 +190,7 @@ def _balance(recording: Recording, axis: str) -> _Balance:
         factor_sd=float(np.sqrt(covariance[0, 0]) / scale[0]),
         explained_ratio=1.0 - float(np.mean(rest**2)) / max(whole, 1e-300),
         weight=1.0 / max(float(normal[0, 0]) / scale[0] ** 2, 1e-300),
+        whole=whole,
         left=float(np.mean((inertia_n - force_n) ** 2)),
     )
 
@@ -183,6 +200,8 @@ def _check_swapped(believed: Believed, recordings: Sequence[Recording], balances
     for recording in recordings:
         _check_gap_side(recording)
         own = [b for b in balances if b.run == recording.log.name]
+        if all(b.left < _GOOD_RATIO * b.whole for b in own):
+            continue  # columns that are not what they are called leave more
         left = sum(b.left for b in own)
         for text, log in _variants(recording.log):
             other = balance.recording_of(log, believed)

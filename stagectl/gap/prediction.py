@@ -8,7 +8,8 @@ known parameters at the values of the findings and s what the effect alone does 
 a is 1 where the effect is there as found, 0 where it is not. In newtons the gap falls from a f to (1 - a) f, f being
 the rms of the force that was found, along the motion. The spread of a comes from noise, from what the recordings of the
 findings leave open in b and in the effect itself, and from how a scatters between them. Nothing is refitted but the
-phase of what repeats in position, where each homing has its own. Pure.
+phase of what repeats in position, where each homing has its own. A known parameter that is wrong is judged alike: its
+column is that of the parameter, as long as its error. Pure.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +25,7 @@ from stagectl.gap import balance, hypotheses
 from stagectl.gap.addition import parted
 from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.believed import Believed
-from stagectl.gap.findings import Findings, Named
+from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.grids import grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.log import Log
@@ -110,19 +111,35 @@ class Evidence:
 
     believed: Believed
     named: tuple[Named, ...]
+    wrong: tuple[ParameterError, ...]
     base: list[tuple[Term, float]]
     base_values: np.ndarray
     filters: dict[str, tuple[np.ndarray, float]]  # autoregression of what is left, by channel
     model: _Model
     rivals: dict[tuple[str, str], dict[tuple[str, str], _Model]]
     late_ratio: float  # share of samples that the recordings lack
-    scatter: np.ndarray  # of each effect's share between recordings
+    scatter: np.ndarray  # of each target's share between recordings
+
+    @property
+    def targets(self) -> tuple[Named | ParameterError, ...]:
+        """Everything that is predicted: effects, then parameters."""
+        return (*self.named, *self.wrong)
+
+    def along(self, target: Named | ParameterError) -> np.ndarray:
+        """Return the amplitudes, of the base and of the effects, that a target stands for; shape (k,)."""
+        if isinstance(target, Named):
+            here = [None] * len(self.base) + [(one.name, one.acts_on) for one in self.named]
+            return np.array([float(key == (target.name, target.acts_on)) for key in here])
+        parts = hypotheses.parts_of(target.name)
+        here = [target.error * (term.name in parts) for term, _ in self.base]
+        return np.array(here + [0.0] * len(self.named))
 
 
 def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evidence:
     """Read findings and their recordings for prediction. Errors: RequestError where there is nothing to predict."""
     named = tuple(effect for effect in findings.named if not _per_run(effect))
-    if not named:
+    wrong = findings.parameter_errors if findings.unknown is None else ()  # beside an unknown force nothing is sure
+    if not named and not wrong:
         raise RequestError("these findings name no effect that could be predicted; `next` shows what to excite")
     recordings = [prepared(log, believed) for log in logs]
     base = hypotheses.parameter_terms(recordings[0])
@@ -147,24 +164,26 @@ def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evi
         known.append((recording, base_columns(recording)))
         z = observed(recording)
         blocks.append((recording, z, columns(recording, z)))
-    prior = np.array([1.0 / sd**2 for _, sd in base] + [0.0] * len(named))
+    free = {part for error in wrong for part in hypotheses.parts_of(error.name)}  # beyond what is stated of them
+    prior = np.array([0.0 if term.name in free else 1.0 / sd**2 for term, sd in base] + [0.0] * len(named))
     wanted = {alias[:2] for one in named for alias in one.aliases}
     terms = [term for term in hypotheses.effect_terms(recordings, grids_for(recordings)) if term.key in wanted]
     filters = _filters(blocks, prior, terms)
     white = [(_white(r, z, filters), _white(r, d, filters)) for r, z, d in blocks]
     covariance = np.linalg.inv(sum((d.T @ d for _, d in white), np.diag(prior)))
     model = _Model(columns, values, covariance)
-    scatter = _scatter(white, values, len(named))
     late_ratio = float(np.mean([1.0 - log.valid.mean() for log in logs]))
     rivals = {
         (one.name, one.acts_on): _rivals(one, named, terms, base_columns, prior, base_values, blocks, filters)
         for one in named
     }
-    return Evidence(believed, named, base, base_values, filters, model, rivals, late_ratio, scatter)
+    seen = Evidence(believed, named, wrong, base, base_values, filters, model, rivals, late_ratio, np.zeros(0))
+    seen.scatter = np.array([_scatter(white, values, seen.along(target)) for target in seen.targets])
+    return seen
 
 
 def expected(seen: Evidence, log: Log) -> list[Expected]:
-    """Say what each effect will do on a planned motion, one a named effect in their order.
+    """Say what each effect and wrong parameter will do on a planned motion, in the order of the targets.
 
     Samples come late as often as in the recordings of the findings.
     """
@@ -176,24 +195,25 @@ def expected(seen: Evidence, log: Log) -> list[Expected]:
     d = _white(recording, raw, seen.filters)
     first = len(seen.base)
     found = []
-    for number, effect in enumerate(seen.named):
-        s = d[:, first + number]
+    for number, target in enumerate(seen.targets):
+        along = seen.along(target)
+        s = d @ along
         energy = float(s @ s)
         if not energy > 0.0:
             continue
-        unit, size = _size(recording, effect)
+        unit, size = _size(recording, target, seen)
         sd = _share_sd(d, s, seen.model.covariance, float(seen.scatter[number]))
         low, high = 1.0 - SIGMAS * sd, 1.0 + SIGMAS * sd
         spread = SIGMAS * size * float(np.hypot(2.0 * sd, _MOTION_RATIO))
-        planned = raw[:, first + number] + raw[:, :first] @ seen.base_values
+        planned = raw @ along + raw[:, :first] @ seen.base_values
         separations = tuple(
             (*key, _separation(recording, seen, d[:, :first], s, rival, planned))
-            for key, rival in seen.rivals[effect.name, effect.acts_on].items()
+            for key, rival in seen.rivals.get((target.name, target.acts_on), {}).items()
         )
-        free = _free_energy(d, first + number, seen.model.covariance, first)
+        free = _free_energy(s, d, seen.model.covariance, np.flatnonzero(along[:first] == 0.0))
         found.append(
             Expected(
-                effect.name, effect.acts_on, unit, size, size * sd, size,
+                target.name, target.acts_on, unit, size, size * sd, size,
                 (size - spread, size + spread), energy, (low, high), float(np.sqrt(free)),
                 separations,
             )
@@ -207,27 +227,27 @@ def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Ou
     z = observed(recording)
     raw = seen.model.columns(recording, z)
     d, zw = _white(recording, raw, seen.filters), _white(recording, z, seen.filters)
-    first = len(seen.base)
     whole = zw - d @ seen.model.values
     mine = _surprise(whole, d, seen.model.covariance)
     outcomes = []
+    targets = {(one.name, one.acts_on): one for one in seen.targets}
     for prediction in predictions:
-        number = [(one.name, one.acts_on) for one in seen.named].index((prediction.name, prediction.acts_on))
-        s = d[:, first + number]
+        target = targets[prediction.name, prediction.acts_on]
+        s = d @ seen.along(target)
         energy = float(s @ s)
         share = 1.0 + float(s @ whole) / energy if energy > 0.0 else 0.0
-        unit, size = _size(recording, seen.named[number])
+        unit, size = _size(recording, target, seen)
         fall = size * (2.0 * share - 1.0)
         margins = []
-        for key, rival in seen.rivals[prediction.name, prediction.acts_on].items():
+        for key, rival in seen.rivals.get((target.name, target.acts_on), {}).items():
             other = _white(recording, rival.columns(recording, z), seen.filters)
             margins.append((*key, _surprise(zw - other @ rival.values, other, rival.covariance) - mine))
         low, high = prediction.share_interval
-        inside = (
-            prediction.decides
-            and low <= share <= high
-            and prediction.fall_interval[0] <= fall <= prediction.fall_interval[1]
+        # how large the forces are that a wrong parameter scales is part of what the plan can't know
+        as_large = isinstance(target, ParameterError) or (
+            prediction.fall_interval[0] <= fall <= prediction.fall_interval[1]
         )
+        inside = prediction.decides and low <= share <= high and as_large
         limit = max(SEPARATED, _MATERIAL_RATIO * energy)
         outcomes.append(
             Outcome(
@@ -383,17 +403,14 @@ def _white(recording: Recording, values: np.ndarray, filters: dict[str, tuple[np
     return np.concatenate(parts)
 
 
-def _scatter(white: Sequence[tuple[np.ndarray, np.ndarray]], values: np.ndarray, count: int) -> np.ndarray:
-    """Return by how much more than noise each effect's share scatters between recordings, at least 1."""
-    found = np.ones(count)
-    for number in range(count):
-        squares = 0.0
-        for z, d in white:
-            s = d[:, values.size - count + number]
-            energy = float(s @ s)
-            squares += float(s @ (z - d @ values)) ** 2 / energy if energy > 0.0 else 0.0
-        found[number] = max(1.0, np.sqrt(squares / max(len(white) - 1, 1)))
-    return found
+def _scatter(white: Sequence[tuple[np.ndarray, np.ndarray]], values: np.ndarray, along: np.ndarray) -> float:
+    """Return by how much more than noise a target's share scatters between recordings, at least 1."""
+    squares = 0.0
+    for z, d in white:
+        s = d @ along
+        energy = float(s @ s)
+        squares += float(s @ (z - d @ values)) ** 2 / energy if energy > 0.0 else 0.0
+    return max(1.0, float(np.sqrt(squares / max(len(white) - 1, 1))))
 
 
 def _share_sd(d: np.ndarray, s: np.ndarray, covariance: np.ndarray, scatter: float) -> float:
@@ -403,10 +420,10 @@ def _share_sd(d: np.ndarray, s: np.ndarray, covariance: np.ndarray, scatter: flo
     return scatter * float(np.sqrt(1.0 / energy + along @ covariance @ along))
 
 
-def _free_energy(d: np.ndarray, place: int, covariance: np.ndarray, first: int) -> float:
-    """Return the energy of one column that errors of the known parameters can't take over."""
-    s, b = d[:, place], d[:, :first]
-    inner = np.linalg.inv(covariance[:first, :first]) + b.T @ b
+def _free_energy(s: np.ndarray, d: np.ndarray, covariance: np.ndarray, others: np.ndarray) -> float:
+    """Return the energy of one column that errors of other known parameters can't take over."""
+    b = d[:, others]
+    inner = np.linalg.inv(covariance[np.ix_(others, others)]) + b.T @ b
     along = b.T @ s
     return max(float(s @ s - along @ np.linalg.solve(inner, along)), 0.0)
 
@@ -419,16 +436,23 @@ def _surprise(rest: np.ndarray, d: np.ndarray, covariance: np.ndarray) -> float:
     return float(rest @ rest - along @ np.linalg.solve(inner, along) + (size if sign > 0 else 0.0))
 
 
-def _size(recording: Recording, effect: Named) -> tuple[str, float]:
-    """Return (unit, rms) of what an effect adds along a motion: a force, or the error of a reading."""
-    known = CATALOGUE[effect.name]
-    values = _mean_values(effect)
-    forces = balance.effect_forces(recording, known, effect.acts_on, [values[name] for name in known.parameters])
-    if effect.acts_on.endswith("_sensor"):
-        error_m = forces.macro_sensor_m if forces.macro_sensor_m is not None else forces.end_sensor_m
+def _size(recording: Recording, target: Named | ParameterError, seen: Evidence) -> tuple[str, float]:
+    """Return (unit, rms) of what a target adds along a motion: a force, or the error of a reading."""
+    if isinstance(target, Named):
+        known = CATALOGUE[target.name]
+        values = _mean_values(target)
+        forces = balance.effect_forces(recording, known, target.acts_on, [values[name] for name in known.parameters])
+    else:
+        forces = Forces()
+        parts = hypotheses.parts_of(target.name)
+        for one in (force for term, _ in seen.base if term.name in parts for force in term.forces(recording)):
+            forces = balance.scaled(one, target.error, forces)
+    error_m = forces.macro_sensor_m if forces.macro_sensor_m is not None else forces.end_sensor_m
+    if error_m is not None:
         return "m", _rms(error_m)
-    own = forces.end_n if effect.acts_on.startswith("micro") else forces.macro_n
-    return "N", _rms(own)
+    if isinstance(target, Named):
+        return "N", _rms(forces.end_n if target.acts_on.startswith("micro") else forces.macro_n)
+    return "N", max(_rms(forces.macro_n), _rms(forces.end_n))
 
 
 def _rms(values: np.ndarray | None) -> float:
@@ -491,7 +515,10 @@ def _separation(
 
 
 def with_outcomes(findings: Findings, outcomes: Sequence[Outcome]) -> Findings:
-    """Return findings in which what held is confirmed, without the aliases that the run ruled out."""
+    """Return findings in which what held is confirmed, without the aliases that the run ruled out.
+
+    A parameter that no outcome speaks of stays as it was.
+    """
     by_key = {(one.name, one.acts_on): one for one in outcomes}
     named = []
     for effect in findings.named:
@@ -502,4 +529,10 @@ def with_outcomes(findings: Findings, outcomes: Sequence[Outcome]) -> Findings:
         out = {(name, place) for name, place, _ in outcome.out}
         aliases = tuple(alias for alias in effect.aliases if alias[:2] not in out)
         named.append(replace(effect, confirmed=outcome.confirmed, aliases=aliases))
-    return replace(findings, named=tuple(named))
+    wrong = tuple(
+        replace(error, confirmed=by_key[error.name, error.acts_on].confirmed)
+        if (error.name, error.acts_on) in by_key
+        else error
+        for error in findings.parameter_errors
+    )
+    return replace(findings, named=tuple(named), parameter_errors=wrong)

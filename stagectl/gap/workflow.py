@@ -10,7 +10,7 @@ import numpy as np
 
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
-from stagectl.gap import balance, hypotheses
+from stagectl.gap import balance, hypotheses, plausibility
 from stagectl.gap.believed import Believed
 from stagectl.gap.competition import Competition
 from stagectl.gap.findings import Findings, Named, ParameterError
@@ -39,13 +39,15 @@ def find(
 ) -> Findings:
     """Find what is missing from a believed machine, `without` some effects of the library.
 
-    Errors: RequestError where a log is on both sides.
+    Errors: RequestError where a log is on both sides, or recordings can't be of this machine (`plausibility`).
     """
     if {log.name for log in training} & {log.name for log in held}:
         raise RequestError("a recording is both training and holdout; give recordings that no fit sees as --holdout")
     logs = [*training, *held]
     say("reading the motion")
+    remarks = plausibility.check_logs(believed, training, held)
     recordings = [balance.recording_of(log, believed) for log in logs]
+    plausibility.check_recordings(believed, recordings)
     noise = noise_of(recordings)
     unsettled = recordings
     recordings, _ = settled(unsettled, noise)
@@ -79,6 +81,7 @@ def find(
         unknown["beside"] = [[effect.name, effect.acts_on] for effect in named]
         named = ()
     solution = solve([*last.judge.base, *chosen], last.evidence.sums)
+    refitted = _refitted(last, chosen, solution, believed)
     return Findings(
         profile=believed.name,
         runs=tuple(log.name for log in training),
@@ -86,14 +89,17 @@ def find(
         verdict=verdict,
         named=named,
         parameter_errors=_parameter_errors(last, chosen, solution),
-        refitted=_refitted(last, chosen, solution, believed),
+        refitted={name: value for name, (value, _) in refitted.items()},
         not_excited=first.not_excited(),
         unknown=unknown,
         reducible_before=before,
         reducible_after=after,
         threshold=judge.threshold,
-        remarks=tuple(remark for log in logs for remark in log.remarks),
+        remarks=(*remarks, *(remark for log in logs for remark in log.remarks)),
         trace=tuple(judge.trace),
+        refitted_sds={name: sd for name, (_, sd) in refitted.items()},
+        profile_path=believed.path,
+        profile_sha256=believed.sha256,
     )
 
 
@@ -168,34 +174,32 @@ def _parameter_errors(search: Competition, chosen: list[Group], solution: Soluti
         term = search.term(group)
         if term.acts_on == "parameter":
             values, sds = solution.of(group)
-            own = stated.get(term.name, stated.get(_PART_OF.get(term.name, ""), 0.0))
+            own = stated[hypotheses.parts_of(term.name)[0]]
             aliases = tuple(key[0] for key, _ in search.judge.aliases(chosen, group) if key[1] == "parameter")
             found.append(ParameterError(term.name, float(values[0]), float(sds[0]), own, aliases))
     return tuple(found)
 
 
-_PART_OF = {"contact_stiffness_n_per_m": "left_stiffness_n_per_m", "backlash_width_m": "left_m"}
+def _refitted(
+    search: Competition, chosen: list[Group], solution: Solution, believed: Believed
+) -> dict[str, tuple[float, float]]:
+    """Return every known parameter's error as fitted and its standard deviation.
 
-
-def _refitted(search: Competition, chosen: list[Group], solution: Solution, believed: Believed) -> dict[str, float]:
-    """Return every known parameter's error as fitted, what it is off beyond its stated uncertainty included."""
+    What a parameter is off beyond its stated uncertainty is included.
+    """
     base = search.judge.base[: len(search.parameters)]
-    found = {
-        term.name: float(solution.of(group)[0][0]) for (term, _), group in zip(search.parameters, base, strict=True)
-    }
-    settled = search.evidence.recordings[0].believed.joint
-    if believed.joint is not None and settled is not None and not search.moved:
-        found["left_m"] += settled.left_m - believed.joint.left_m
-        found["right_m"] += settled.right_m - believed.joint.right_m
+    groups = {term.name: [group] for (term, _), group in zip(search.parameters, base, strict=True)}
     for group in chosen:
         term = search.term(group)
         if term.acts_on == "parameter":
-            value = float(solution.of(group)[0][0])
-            part = _PART_OF.get(term.name)
-            own = (part, part.replace("left", "right")) if part else (term.name,)
-            for name in own:
-                if name in found:
-                    found[name] += value
+            for name in hypotheses.parts_of(term.name):
+                groups[name].append(group)
+    found = {name: solution.total_of(summed) for name, summed in groups.items()}
+    settled = search.evidence.recordings[0].believed.joint
+    if believed.joint is not None and settled is not None and not search.moved:
+        for name in ("left_m", "right_m"):
+            value, sd = found[name]
+            found[name] = value + getattr(settled, name) - getattr(believed.joint, name), sd
     return found
 
 
