@@ -71,6 +71,7 @@ class Competition:
         )
 
         self.judge.modelled = self._modelled()
+        self.judge.is_rough = any(level.white_force_n > 0.0 for level in noise.values())
 
     def _modelled(self) -> float:
         """Return what dry friction of the model explains: a law with a step is never as exact as the noise is small."""

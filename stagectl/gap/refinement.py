@@ -129,7 +129,9 @@ class Refiner:
         else:
             factor = _BRACKET**narrow
             reach = narrow * _NEAR_ZERO * (high - low)  # of a shape that may be zero, factors lead nowhere
-            sized = name == effect.parameters[0] and not term.linear  # found by trials: its sign and its decade are known
+            sized = (
+                name == effect.parameters[0] and not term.linear
+            )  # found by trials: its sign and its decade are known
             by_factor = sized or abs(at) > reach or low >= 0.0
             ends = sorted((at / factor, at * factor)) if by_factor else (at - reach, at + reach)
             low, high = max(low, ends[0]), min(high, ends[1])

@@ -38,6 +38,11 @@ LATE_SHARE = 0.12
 and a lag of 0.45 ms at d' 45 lost a tenth of its gain to a delay."""
 
 
+LOW_SPEED_SHARE = 0.02
+"""Of a machine with more force noise than its sensors explain, no friction is an exact law: at speed, where velocities
+have a sign, dry and sub-linear friction differ by 1.2 % of their gain on a real axis. Slow reversals tell them apart."""
+
+
 class Source(Protocol):
     """Where sums come from; they grow as hypotheses get new columns."""
 
@@ -62,6 +67,7 @@ class Judge:
     modelled: float = (
         0.0  # what laws of the model explain already that are known to be inexact, in squares of the noise
     )
+    is_rough: bool = False  # a force noise besides that of the sensors
     trace: list[str] = field(default_factory=list)
     _known_rivals: dict[frozenset[tuple[int, ...]], list[Group]] = field(default_factory=dict)
 
@@ -195,8 +201,8 @@ class Judge:
             before = [group.key for group in chosen]
             for k in range(len(chosen)):
                 rest = [*chosen[:k], *chosen[k + 1 :]]
-                candidates = [chosen[k], *self.rivals(rest)]
-                allowed = [group for group in candidates if self._allowed([*rest, group])] or [chosen[k]]
+                rivals = [group for group in self.rivals(rest) if self._stays(rest, group)]
+                allowed = [group for group in (chosen[k], *rivals) if self._allowed([*rest, group])] or [chosen[k]]
                 best = self._simplest(rest, allowed)
                 if best.key != chosen[k].key or self._worth([*rest, best]) > self._worth(chosen) + 1e-6:
                     chosen = [*chosen[:k], best, *chosen[k + 1 :]]
@@ -209,7 +215,9 @@ class Judge:
         now, gains = self.gains(chosen), self.gains([*chosen, group])
         trained, apart = gains[0] - now[0], gains[1] - now[1]
         whole = self.gain([*chosen, group])
-        least = MATERIAL_RATIO * (whole - self.gain([]) + self.modelled)
+        known = CATALOGUE.get(group.key[0])
+        repeats = known is not None and known.period != ""  # at one pitch: no inexact law leaves that
+        least = 0.0 if repeats else MATERIAL_RATIO * (whole - self.gain([]) + self.modelled)
         gained = whole - self.gain(chosen)
         return (
             trained > 0.0
@@ -252,10 +260,22 @@ class Judge:
             if other.key in taken or other.complexity > group.complexity or not self._allowed([*rest, other]):
                 continue
             margin = with_it - self.gain([*rest, other])
-            late = _is_late_reading(group) and _is_late_reading(other)
-            if margin < ALIAS_GAIN + (LATE_SHARE if late else ALIAS_SHARE) * gained:
+            if margin < ALIAS_GAIN + self._inexact_share(group, other) * gained:
                 margins[other.key] = margin
         return sorted(margins.items(), key=lambda row: row[1])
+
+    def _inexact_share(self, group: Group, other: Group) -> float:
+        """Return the share of a gain that two laws must differ by to be told apart."""
+        if _is_late_reading(group) and _is_late_reading(other):
+            return LATE_SHARE
+        if self.is_rough and _shows_at_low_speed(group) and _shows_at_low_speed(other):
+            return LOW_SPEED_SHARE
+        return ALIAS_SHARE
+
+
+def _shows_at_low_speed(group: Group) -> bool:
+    known = CATALOGUE.get(group.key[0])
+    return known is not None and known.shown_by == "low speed"
 
 
 def _is_late_reading(group: Group) -> bool:
