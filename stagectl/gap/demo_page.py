@@ -69,7 +69,7 @@ def page(closed: Closed, findings_page: str, files: Sequence[tuple[str, str]]) -
     )
     return Report(
         "stagectl gap demo",
-        f"One effect was hidden from the profile. {found} was found, confirmed by a prediction, added: the stage follows "
+        f"One effect was hidden from the profile. {found} was found, confirmed by a prediction, added: it follows "
         f"{ratio:.1f} times closer. Recorded over the wire with the software rig in virtual time.",
         (table,),
         figures=_figures(closed),
