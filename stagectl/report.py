@@ -11,6 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import quote
 
 from stagectl.errors import RecordError, RequestError
 
@@ -89,7 +90,10 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A page: title, banner (what to know before reading any number), facts, tables, figures, sections."""
+    """A page: title, banner (what to know before reading any number), facts, links, tables, figures, sections.
+
+    links: (file beside the page, what it is). The page is whole without them.
+    """
 
     title: str
     banner: str
@@ -97,6 +101,7 @@ class Report:
     figures: Sequence[Figure] = ()
     facts: Sequence[tuple[str, str]] = field(default=())
     sections: Sequence[Section] = ()
+    links: Sequence[tuple[str, str]] = ()
 
     def html(self) -> str:
         """Render the page."""
@@ -106,6 +111,10 @@ class Report:
         if self.facts:
             pairs = "".join(f"<div><dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd></div>" for k, v in self.facts)
             parts.append(f"<dl>{pairs}</dl>")
+        parts += [
+            f'<p class="link"><a href="{html.escape(quote(file))}">{html.escape(said)}</a></p>'
+            for file, said in self.links
+        ]
         parts += [_table_html(table) for table in self.tables]
         parts += [_figure_html(figure, number) for number, figure in enumerate(self.figures, 1)]
         parts += [_section_html(section) for section in self.sections]
@@ -247,6 +256,7 @@ th,td{text-align:left;padding:.35rem .9rem .35rem 0;border-bottom:1px solid var(
 th{color:var(--muted);font-weight:600;border-bottom:1.5px solid var(--muted)}
 th.n,td.n{text-align:right;white-space:nowrap}
 th:last-child,td:last-child{padding-right:0}
+.link{margin:1rem 0 0}a{color:var(--series-2)}
 ul{margin:0;padding-left:1.2rem}
 code{background:var(--band);padding:.05rem .3rem;overflow-wrap:anywhere}
 .note,figcaption p{font-size:.88rem;color:var(--muted);margin:.4rem 0 .6rem}

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+from pyarrow import csv
 
 H = 1e-3
 MASS_KG = 40.0
@@ -111,7 +113,6 @@ STAGE_MAP = {
 
 
 def write_csv(table: dict, path: Path) -> Path:
-    """Write a table with all its digits."""
-    rows = np.column_stack(list(table.values()))
-    np.savetxt(path, rows, delimiter=",", header=",".join(table), comments="", fmt="%.15g")
+    """Write a table with all its digits; nan is an empty cell."""
+    csv.write_csv(pa.table({name: pa.array(values, from_pandas=True) for name, values in table.items()}), path)
     return path

@@ -6,27 +6,29 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
-import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from stagectl import report, toml_file
+from stagectl import toml_file
 from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
+from stagectl.commands.gap import PAGE
 from stagectl.commands.gap_next import allowed, judged_table, perform
 from stagectl.commands.opening import home_and_arm
 from stagectl.errors import DriveError
-from stagectl.gap import hiding, moves, next_move, prediction
+from stagectl.gap import demo_page, findings_page, hiding, moves, next_move, prediction, residual
 from stagectl.gap.application import application
 from stagectl.gap.believed import believed_of_profile
+from stagectl.gap.demo_page import Closed, Followed
+from stagectl.gap.findings import Findings
 from stagectl.gap.findings_file import FINDINGS, write_findings
 from stagectl.gap.log import Log, read_log
 from stagectl.gap.moves import Move
-from stagectl.gap.prediction import Outcome, with_outcomes
+from stagectl.gap.prediction import with_outcomes
 from stagectl.gap.prediction_file import OUTCOME, PREDICTION, write_outcome, write_prediction
+from stagectl.gap.residual import Residual
 from stagectl.gap.workflow import find
 from stagectl.profile import Profile, load_profile, search_folders
 from stagectl.record import read_run
-from stagectl.report import Quantity, Report
 from stagectl.run_folder import reserve
 from stagectl.run_scores import read_truth, write_truth
 from stagectl.scoring import score
@@ -39,6 +41,14 @@ FOLLOWED = "fast stroke"
 """No fit sees it; before and after it shows how well the stage follows."""
 
 REPORT, PROFILE, MACHINE = "report.html", "found.toml", "machine.toml"
+
+_FILES = (
+    (PROFILE, "the profile with what was confirmed"),
+    (MACHINE, "the machine with its secret"),
+    (FINDINGS, "the findings"),
+    (PREDICTION, "what the confirming move would show, written before it"),
+    (OUTCOME, "what it showed"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +82,8 @@ class _Rig:
             if truth is not None:
                 write_truth(stage.folder, truth, load_machine(self.machine).backlash)
 
-    def follows(self, move: Move) -> tuple[Path, float]:
-        """Record one move; returns its run and the end's true error while it lasts, m rms. Errors: DriveError."""
+    def follows(self, move: Move) -> tuple[Path, Followed]:
+        """Record one move; returns its run and how the end truly followed while it lasted. Errors: DriveError."""
         with self.opened(move.name.replace(" ", "-")) as stage:
             armed = home_and_arm(stage)
             done = stage.run(move.trajectory, self.profile.control.law) if armed.finished else armed
@@ -84,7 +94,8 @@ class _Rig:
         if truth is None:
             raise DriveError(f"gap demo, {move.name}: the rig kept no truth; nothing can be scored")
         scored = score(run, truth, done.first_row, done.rows)
-        return stage.folder, float(np.sqrt(np.nanmean(scored.true_mean_error_m**2)))
+        t_s = scored.t_s - scored.t_s[0]
+        return stage.folder, Followed(t_s, scored.rows["setpoint_position_m"], scored.true_mean_error_m)
 
 
 def show(voice: Voice, profile: str, runs_root: Path, seed: int) -> Answer:
@@ -108,14 +119,17 @@ def show(voice: Voice, profile: str, runs_root: Path, seed: int) -> Answer:
     by_name = {move.name: move for move in candidates}
     voice.note("recording: one effect of the machine is not in the profile")
     training = [_log(rig.follows(by_name[name])[0], believed.period_s, believed) for name in TRAINING]
-    held, error_before_m = rig.follows(by_name[FOLLOWED])
+    held, before = rig.follows(by_name[FOLLOWED])
     apart = [_log(held, believed.period_s, believed)]
     found = find(believed, training, apart, seed=seed, say=voice.note)
     file = folder / FINDINGS
     write_findings(found, file)
+    voice.whole_file = file
     names = ", ".join(f"{one.name} on {one.acts_on}" for one in found.named) or found.verdict
     voice.note(f"found: {names}")
     data = {"hidden": hidden, "found": names, "folder": str(folder)}
+    residuals = residual.residuals(believed, found, training, apart)
+    _search_page(found, residuals, path, file, seed)
     if not found.named:
         return Answer(data, [_secret(hidden), f"found   {names}: the demo ends here", f"files   {folder}"], ENDED_EARLY)
     seen = prediction.evidence(believed, [*training, *apart], found)
@@ -129,13 +143,14 @@ def show(voice: Voice, profile: str, runs_root: Path, seed: int) -> Answer:
     write_outcome(outcomes, str(run), folder / PREDICTION, date.today().isoformat(), folder / OUTCOME)
     found = with_outcomes(found, outcomes)
     write_findings(found, file)
+    _search_page(found, residuals, path, file, seed)
     first = outcomes[0]
     data |= {
         "confirmed": [one.name for one in outcomes if one.confirmed],
         "unit": first.unit,
         "gap_before": first.gap_before,
         "gap_after": first.gap_after,
-        "error_before_m": error_before_m,
+        "error_before_m": before.rms_m,
     }
     shown: list = [_secret(hidden), f"found   {names}", judged_table(outcomes, chosen.expected)]
     if not any(one.confirmed for one in outcomes):
@@ -143,12 +158,18 @@ def show(voice: Voice, profile: str, runs_root: Path, seed: int) -> Answer:
     done = application(path.read_bytes().decode(), found, candidates=False, date=date.today().isoformat())
     replace_whole(folder / PROFILE, done.text.encode())
     better = _Rig(load_profile(folder / PROFILE), machine, folder, voice, seed)
-    error_after_m = better.follows(by_name[FOLLOWED])[1]
-    data |= {"error_after_m": error_after_m, "profile": str(folder / PROFILE), "report": str(folder / REPORT)}
-    _page(names, hidden, first, error_before_m, error_after_m).write(folder / REPORT)
-    shown += [_numbers(first, error_before_m, error_after_m), f"files   {folder}", f"report  {folder / REPORT}"]
-    closed = first.gap_after < first.gap_before and error_after_m < error_before_m
-    return Answer(data, shown, 0 if closed else ENDED_EARLY)
+    after = better.follows(by_name[FOLLOWED])[1]
+    data |= {"error_after_m": after.rms_m, "profile": str(folder / PROFILE), "report": str(folder / REPORT)}
+    closed = Closed(_secret(hidden)[8:], found, residuals, first, chosen.move.name, FOLLOWED, before, after)
+    demo_page.page(closed, PAGE, _FILES).write(folder / REPORT)
+    shown += [_numbers(closed), f"files   {folder}", f"report  {folder / REPORT}"]
+    is_better = first.gap_after < first.gap_before and after.rms_m < before.rms_m
+    return Answer(data, shown, 0 if is_better else ENDED_EARLY)
+
+
+def _search_page(found: Findings, residuals: Sequence[Residual], profile: Path, file: Path, seed: int) -> None:
+    """Write the page that `stagectl gap` would write; its ladder needs a controller of an observed machine."""
+    findings_page.page(found, residuals, [], profile=str(profile), file=file, seed=seed).write(file.with_name(PAGE))
 
 
 def _log(folder: Path, period_s: float, believed) -> Log:
@@ -160,27 +181,8 @@ def _secret(hidden: dict) -> str:
     return f"hidden  {hidden['name']} on {hidden['acts_on']}: {escape(values)}"
 
 
-def _rows(first: Outcome, before_m: float, after_m: float) -> list[tuple[str, Quantity, Quantity]]:
-    return [
-        ("gap", Quantity(first.gap_before, first.unit), Quantity(first.gap_after, first.unit)),
-        ("tracking error, true, rms", Quantity(before_m, "m"), Quantity(after_m, "m")),
-    ]
-
-
-def _numbers(first: Outcome, before_m: float, after_m: float) -> Table:
+def _numbers(closed: Closed) -> Table:
     table = Table("", "before", "after", box=None, header_style="bold")
-    for name, before, after in _rows(first, before_m, after_m):
+    for name, before, after in demo_page.rows(closed):
         table.add_row(name, str(before), str(after))
     return table
-
-
-def _page(names: str, hidden: dict, first: Outcome, before_m: float, after_m: float) -> Report:
-    rows: Sequence = _rows(first, before_m, after_m)
-    table = report.Table(
-        "The loop closed",
-        ("", "before", "after"),
-        rows,
-        "gap: force left along the found effect on the move that confirmed it, rms",
-    )
-    banner = "Recorded over the wire with the software rig in virtual time; one effect was hidden from the profile."
-    return Report("stagectl gap demo", banner, (table,), facts=(("hidden", _secret(hidden)[8:]), ("found", names)))
