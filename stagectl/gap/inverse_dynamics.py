@@ -154,15 +154,11 @@ def _solved(matrix: np.ndarray, force: np.ndarray, names: list[str]) -> tuple[np
     length = np.linalg.norm(matrix, axis=0)
     dead = [name for name, size in zip(names, length, strict=True) if not size > 0.0]
     if dead:
-        raise RequestError(
-            f"these recordings do not excite {', '.join(dead)}; leave it out, or record others"
-        )
+        raise RequestError(f"these recordings do not excite {', '.join(dead)}; leave it out, or record others")
     _, singular, turned = np.linalg.svd(matrix / length, full_matrices=False)
     if not singular[-1] ** 2 > _LEAST_INDEPENDENT:
         alike = [name for name, share in zip(names, np.abs(turned[-1]), strict=True) if share > 0.1]
-        raise RequestError(
-            f"these recordings can't tell {', '.join(alike)} apart; leave one out, or record others"
-        )
+        raise RequestError(f"these recordings can't tell {', '.join(alike)} apart; leave one out, or record others")
     solution = np.linalg.lstsq(matrix / length, force, rcond=None)[0] / length
     left = force - matrix @ solution
     inverse = (turned.T / singular**2) @ turned / np.outer(length, length)
