@@ -7,6 +7,7 @@ a change of the machine that is known. Pure.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -53,17 +54,12 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class Remedies:
-    """What splits a set: names of moves, signals that have to be recorded too, and changes of the machine."""
+class Remedy:
+    """What splits a set: a move of the library, a signal that has to be recorded too, a known change of the machine."""
 
-    moves: tuple[str, ...] = ()
-    signals: tuple[str, ...] = ()
-    changes: tuple[str, ...] = ()
-
-    @property
-    def all(self) -> tuple[str, ...]:
-        """All of them, moves first."""
-        return (*self.moves, *self.signals, *self.changes)
+    kind: Literal["move", "signal", "change"]
+    name: str
+    frees: str = ""  # the one member that it tells from the others; empty: all
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +69,7 @@ class AliasSet:
     name: str
     why: str
     members: tuple[Member, ...]
-    remedies: Remedies
+    remedies: tuple[Remedy, ...]
     beside: tuple[Term, ...] = ()  # free, whatever their size
     holds: tuple[str, ...] = ()  # known parameters that the set takes as they are believed
 
@@ -120,7 +116,7 @@ def _common_scale(r: Recording) -> AliasSet:
         "common scale of all forces and masses",
         "x'' = (K i - b v - k x) / m: e K, e b, e k over e m is the same motion; only ratios are known",
         tuple(replace(known[name], sizes=(RATIO,)) for name in names),
-        Remedies(changes=("a known added mass",)),
+        (Remedy("change", "a known added mass"),),
     )
 
 
@@ -137,7 +133,7 @@ def _delays(r: Recording) -> AliasSet:
         "sensor delay against actuator delay",
         "m x'' = u(t - T_a) + f(x, x'), y(t) = x(t - T_s): the same as m y'' = u(t - T_a - T_s) + f(y, y')",
         tuple(members),
-        Remedies(signals=(CURRENTS,)),
+        (Remedy("signal", CURRENTS),),
     )
 
 
@@ -196,6 +192,7 @@ def _constants(r: Recording) -> AliasSet:
     smooth = {"smoothing_m_per_s": dry.get("smoothing_m_per_s", SMOOTHING_M_PER_S)}
     size_n = _force_n(r)
     uneven = CATALOGUE["asymmetric_coulomb_friction"]
+    uneven_name, amplifier_name = "asymmetric_coulomb_friction on macro_force", "amplifier offset on macro_command"
 
     def uneven_forces(r: Recording) -> Forces:
         values = smooth | {"forward_n": 1.0, "backward_n": -1.0}
@@ -207,7 +204,7 @@ def _constants(r: Recording) -> AliasSet:
 
     return AliasSet(
         "offset, tilt, amplifier offset, asymmetric Coulomb friction",
-        "-F_+ for v > 0 and F_- for v < 0 is -(F_+ + F_-) / 2 sgn v - (F_+ - F_-) / 2; m g s and K i_0 are constant too",
+        "-F_+ for v > 0, F_- for v < 0 is -(F_+ + F_-) / 2 sgn v - (F_+ - F_-) / 2; m g s, K i_0 are constant too",
         (
             _effect("offset", "macro_force", size_n),
             _effect("gravity_tilt", "macro_force", ACCELERATION_M_PER_S2 / 9.80665),
@@ -222,7 +219,11 @@ def _constants(r: Recording) -> AliasSet:
                 (size_n,),
             ),
         ),
-        Remedies(("slow reversals",), (CURRENTS,), ("a known added mass",)),
+        (
+            Remedy("move", "slow reversals", uneven_name),
+            Remedy("signal", CURRENTS, amplifier_name),
+            Remedy("change", "a known added mass", "gravity_tilt on macro_force"),
+        ),
         beside=(term_of(CATALOGUE["coulomb_friction"], "macro_force", smooth),),
     )
 
@@ -240,7 +241,7 @@ def _springs(r: Recording) -> AliasSet:
             _effect("cable_spring", "macro_force", stiffness, {"anchor_m": 0.0}),
             _effect("linear_stiffness", "macro_force", stiffness),
         ),
-        Remedies(changes=("the cable unhooked",)),
+        (Remedy("change", "the cable unhooked"),),
         beside=(term_of(CATALOGUE["offset"], "macro_force", {}),),
     )
 
@@ -254,7 +255,7 @@ def _cable_loop(r: Recording) -> AliasSet:
             _effect("cable_hysteresis", "macro_force", size_n, {"slip_m": CABLE_SLIP_M, "exponent_ratio": 0.0}),
             _effect("linear_stiffness", "macro_force", size_n / CABLE_SLIP_M),
         ),
-        Remedies(("slow stroke", "middle stroke")),
+        (Remedy("move", "slow stroke"), Remedy("move", "middle stroke")),
         beside=(
             term_of(CATALOGUE["offset"], "macro_force", {}),
             term_of(CATALOGUE["coulomb_friction"], "macro_force", {"smoothing_m_per_s": SMOOTHING_M_PER_S}),
@@ -264,11 +265,22 @@ def _cable_loop(r: Recording) -> AliasSet:
 
 def _mode(r: Recording) -> AliasSet:
     known = _known(r)
+    flexible = CATALOGUE["flexible_mode"]
+
+    def ringing(r: Recording) -> Forces:
+        # acceleration by what drives: the measured one's noise would ring, and look like something that was excited
+        driving_n = balance.known_forces(r).macro_n
+        driven = {} if driving_n is None else {"acceleration_m_per_s2": driving_n / r.mass_kg("macro")}
+        known = balance.quantities(r, "macro", "macro_force") | driven
+        arguments = [known[name] for name in flexible.quantities]
+        return Forces(macro_n=balance.along_motion(flexible, arguments, [MODE[name] for name in flexible.parameters]))
+
+    mode = _of("flexible_mode", "macro_force", ringing, "share_of_shape_ratio")
     return AliasSet(
         "flexible mode far above the band, delay, mass",
         "mu m (w / w_m)^2 / (1 - (w / w_m)^2 + 2 i z w / w_m) a: at one w a mass error, its small odd part a delay",
-        (_effect("flexible_mode", "macro_force", 1.0, MODE), known["macro_mass_kg"], known["macro_latch_s"]),
-        Remedies(("fast stroke",)),
+        (Member("flexible_mode on macro_force", mode, (1.0,)), known["macro_mass_kg"], known["macro_latch_s"]),
+        (Remedy("move", "fast stroke"),),
         holds=(*MOTORS, "micro_reaction on macro_force"),
     )
 
@@ -285,7 +297,7 @@ def _periodic(recordings: Sequence[Recording]) -> AliasSet:
             _effect("cogging", "macro_force", _force_n(r), shape),
             _effect("current_ripple", "macro_actuator", RIPPLE_RATIO, shape),
         ),
-        Remedies(("sine 0.3 Hz", "fast stroke")),
+        (Remedy("move", "sine 0.3 Hz"), Remedy("move", "fast stroke")),
     )
 
 
@@ -298,7 +310,7 @@ def _reaction(r: Recording) -> AliasSet:
         "reaction of the micro's drive against mass of the macro",
         "while the bodies move together the micro's force is m_end a: a m_end a and m_macro e a are one column",
         (replace(reaction, sizes=(REACTION_RATIO,)), known["macro_mass_kg"]),
-        Remedies(("sweep over both edges",)),
+        (Remedy("move", "sweep over both edges"),),
         holds=MOTORS,
     )
 
@@ -309,7 +321,7 @@ def _drift() -> AliasSet:
         "which of two sensors drifts",
         "only macro minus end meets a force, that of the joint: D on one sensor is -D on the other",
         tuple(_effect("thermal_drift", place, DRIFT_M, shape) for place in ("macro_sensor", "end_sensor")),
-        Remedies(signals=(ENCODER,)),
+        (Remedy("signal", ENCODER),),
     )
 
 
@@ -326,7 +338,7 @@ def _zero(r: Recording) -> AliasSet:
             _effect("backlash_centre_shift", "contact_edge", size_m),
             Member("zero of the relative position on end_sensor", zero, (size_m,)),
         ),
-        Remedies(signals=(GAP_SENSOR,)),
+        (Remedy("signal", GAP_SENSOR),),
         beside=tuple(term_of(CATALOGUE["offset"], place, {}) for place in ("macro_force", "micro_force")),
     )
 
@@ -357,8 +369,8 @@ def _gap_sensor(r: Recording, forces: Forces) -> np.ndarray | None:
     return sum(parts[1:], parts[0]) / _SENSOR_NOISE_M if parts else None
 
 
-_CURRENT_NOISE_RATIO = 0.01
+_CURRENT_NOISE_RATIO = 0.002
 _SENSOR_NOISE_M = 1e-6
 
 SIGNALS: dict[str, Reads] = {CURRENTS: _currents, ENCODER: _encoder, GAP_SENSOR: _gap_sensor}
-"""Signals that may be recorded besides: currents to 1 % of the largest, sensors to 1 um a sample."""
+"""Signals that may be recorded besides: currents to 0.2 % of the largest, sensors to 1 um a sample."""

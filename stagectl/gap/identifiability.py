@@ -57,8 +57,13 @@ class Separation:
         """One line for a report."""
         alike = "; ".join(" / ".join(names) for names in self.inseparable)
         unseen = f"not excited: {', '.join(self.not_excited)}" if self.not_excited else ""
-        said = ". ".join(part for part in (alike, unseen) if part) or "told apart"
-        return f"{self.name}: {said}. Splits: {', '.join(self.remedies)}" if not self.whole else f"{self.name}: {said}"
+        split = f"splits: {', '.join(self.remedies)}" if self.remedies else ""
+        return f"{self.name}: " + (". ".join(part for part in (alike, unseen, split) if part) or "told apart")
+
+
+def not_separable(recordings: Sequence[Recording]) -> tuple[Separation, ...]:
+    """Return the sets of which these recordings, whose noise is set, can't tell the members apart: for a report."""
+    return tuple(one for one in separations(recordings) if one.inseparable)
 
 
 def separations(
@@ -158,7 +163,8 @@ class _Table:
             numbers: list[int] = []
             rows: list[np.ndarray] = []
             for group in self._groups.values():
-                for number, forces in zip(group.columns, self._evidence.terms[group.columns[0]].forces(recording)):
+                term = self._evidence.terms[group.columns[0]]
+                for number, forces in zip(group.columns, term.forces(recording), strict=True):
                     row = SIGNALS[name](recording, forces)
                     if row is not None:
                         numbers.append(number)
@@ -212,16 +218,23 @@ def _separation(one: AliasSet, information: np.ndarray, owner: np.ndarray) -> Se
     losses = np.maximum(values, 0.0) * reach**2
     lost = losses < ALIAS_GAIN
     shares = directions[:, lost] @ directions[:, lost].T
+    inseparable = tuple(tuple(names[k] for k in alike) for alike in _connected(shares, owner[seen]))
     return Separation(
         one.name,
         one.why,
         rank=int(np.sum(~lost)),
         columns=len(owner),
-        inseparable=tuple(tuple(names[k] for k in alike) for alike in _connected(shares, owner[seen])),
+        inseparable=inseparable,
         power=float(norm.cdf(np.sqrt(losses.min(initial=np.inf)) + norm.ppf(_FALSE_RATE))),
         not_excited=tuple(unseen),
-        remedies=one.remedies.all,
+        remedies=_useful(one, inseparable),
     )
+
+
+def _useful(one: AliasSet, inseparable: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
+    """Name what would split what is left together."""
+    together = {name for names in inseparable for name in names}
+    return tuple(r.name for r in one.remedies if together and (not r.frees or r.frees in together))
 
 
 def _connected(shares: np.ndarray, owner: np.ndarray) -> list[list[int]]:
