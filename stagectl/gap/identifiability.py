@@ -25,8 +25,9 @@ from stagectl.gap.hypotheses import Term
 from stagectl.gap.log import Log
 from stagectl.gap.moves import Move
 from stagectl.gap.noise import noise_of, slow_noise
+from stagectl.gap.normal_equations import Group, Sums, active_slots, normal_of
 from stagectl.gap.planned import planned_log
-from stagectl.gap.selection import ALIAS_GAIN, Group, Sums, active_slots, normal_of
+from stagectl.gap.selection import ALIAS_GAIN
 
 _JITTER = 1e-10
 _HIGH_SHARE = 0.3  # of the sample rate
@@ -83,13 +84,19 @@ def separations(
     return [table.judged(one) for one in sets]
 
 
-def separations_of(believed: Believed, logs: Sequence[Log], **asked: Collection[str]) -> list[Separation]:
+def separations_of(
+    believed: Believed,
+    logs: Sequence[Log],
+    *,
+    signals: Collection[str] = (),
+    absent: Mapping[str, Collection[str]] | None = None,
+) -> list[Separation]:
     """Judge all sets of a believed machine by logs; see `separations`."""
     recordings = [balance.recording_of(log, believed) for log in logs]
     noise = noise_of(recordings)
     for recording in recordings:
         balance.set_noise(recording, noise)
-    return separations(recordings, **asked)  # pyright: ignore[reportArgumentType]
+    return separations(recordings, signals=signals, absent=absent)
 
 
 def splitting(recordings: Sequence[Recording], one: AliasSet, moves: Sequence[Move]) -> tuple[str, ...]:
