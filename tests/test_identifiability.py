@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from bench import emps
 from sim_backend.machine import load_machine
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.alias_sets import ENCODER, GAP_SENSOR, alias_sets
@@ -293,3 +294,13 @@ def test_every_set_stands_on_its_page(stage):
         assert one.why in page
         for remedy in one.remedies:
             assert remedy.name in page
+
+
+@pytest.mark.skipif(emps.folder() is None, reason="STAGECTL_DATA names no folder with emps/DATA_EMPS.mat")
+def test_on_emps_the_constant_forces_are_one_set():
+    folder = emps.folder()
+    assert folder is not None
+    believed, training, held = emps.read(folder)
+    named = {one.name: one for one in separations_of(believed, [*training, *held])}
+    assert named[CONSTANTS].inseparable == ((OFFSET, TILT, AMPLIFIER, UNEVEN),)
+    assert named[DELAYS].inseparable == ((LATE_MACRO, "macro_latch_s"),)
