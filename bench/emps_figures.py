@@ -9,6 +9,7 @@ from stagectl.errors import StagectlError
 from stagectl.gap import addition, arbiter
 from stagectl.gap.believed import Believed
 from stagectl.gap.findings import Findings, Named
+from stagectl.gap.inverse_dynamics import fit_inverse_dynamics
 from stagectl.gap.log import Log
 from stagectl.gap.workflow import find
 
@@ -18,7 +19,8 @@ TRAINING = Bar("EMPS: closed-loop force gap, training", "N", 2.0)
 HELD = Bar("EMPS: closed-loop force gap, PULSES", "N", 2.85)
 LOW_SPEED = Bar("EMPS: closed-loop force gap, training, a low-speed law among the names", "N", 1.35)
 TIME = Bar("EMPS: time", "s", 30.0)
-_ALL = (RIGHT, WRONG, TRAINING, HELD, LOW_SPEED, TIME)
+INVERSE = Bar("EMPS: inverse-dynamics fit, largest deviation from published M, Fv, Fc, offset", "%", 0.5)
+_ALL = (RIGHT, WRONG, TRAINING, HELD, LOW_SPEED, TIME, INVERSE)
 
 PITCH_M = (2.48e-3, 2.52e-3)
 _LOW_SPEED_LAWS = frozenset({"sublinear_viscous_friction", "dahl_friction", "lugre_friction"})
@@ -52,6 +54,15 @@ def figures(say: Say) -> Iterator[Figure]:
     else:
         yield absent(LOW_SPEED, "no low-speed law was named")
     yield judged(TIME, took_s, reason="one search, warm")
+    yield inverse_dynamics(training)
+
+
+def inverse_dynamics(training: list[Log]) -> Figure:
+    """Fit the standard model as it was published, and compare."""
+    found = fit_inverse_dynamics(training).values
+    away = max(abs(found[name] / value - 1.0) for name, value in emps.PUBLISHED.items())
+    said = ", ".join(f"{name.split('.')[0].removesuffix('_kg')} {found[name]:.5g}" for name in emps.PUBLISHED)
+    return judged(INVERSE, 100.0 * away, reason=said)
 
 
 def _text(one: Named) -> str:

@@ -46,4 +46,4 @@ def test_without_its_data_every_row_says_so(monkeypatch, tmp_path):
     rows = list(emps_figures.figures(lambda text: None))
     assert [row.holds for row in rows] == [None] * len(rows)
     assert all("STAGECTL_DATA" in row.reason for row in rows)
-    assert len(rows) == 6
+    assert len(rows) == 7

@@ -425,7 +425,7 @@ def effect_forces(
     axis = "macro" if place.startswith("macro") else "end"
     known = quantities(recording, axis, place)
     if place.endswith("_sensor"):
-        return _misread(recording, axis, reading_error_m(recording, effect, place, parameters, whole), whole)
+        return misread(recording, axis, reading_error_m(recording, effect, place, parameters, whole), whole)
     if place.endswith("_command"):
         return _commanded(recording, axis, effect, parameters)
     value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
@@ -506,7 +506,7 @@ def _edges_moved(
     return Forces(macro_n=-push_n, end_n=push_n)
 
 
-def _misread(recording: Recording, axis: str, error_m: np.ndarray, whole: bool) -> Forces:
+def misread(recording: Recording, axis: str, error_m: np.ndarray, whole: bool) -> Forces:
     """Return what a sensor error does: to the position, and to the joint's forces that were taken at a wrong place."""
     sampled_m = np.ascontiguousarray(error_m[:, 0])
     joint, end = recording.believed.joint, recording.end

@@ -48,9 +48,10 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
     def inertia(axis: str) -> Callable[[Recording], Forces]:
         def of(r: Recording) -> Forces:
             known = balance.known_forces(r)
+            share = r.belief(axis).mass_kg / r.mass_kg(axis)  # a payload is known
             if axis == "macro":
-                return Forces(macro_n=None if known.macro_n is None else -known.macro_n)
-            return Forces(end_n=None if known.end_n is None else -known.end_n)
+                return Forces(macro_n=None if known.macro_n is None else -share * known.macro_n)
+            return Forces(end_n=None if known.end_n is None else -share * known.end_n)
 
         return of
 
