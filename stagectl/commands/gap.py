@@ -156,6 +156,7 @@ def _sentences(findings: Findings, path: Path) -> list[str]:
     ]
     if findings.not_excited:
         said.append(f"Not excited: {', '.join(findings.not_excited)}.")
+    said += [f"Not told apart by these runs: {text}." for text in findings.not_separable]
     return [*said, f"Findings: {path}"]
 
 

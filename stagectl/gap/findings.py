@@ -59,6 +59,7 @@ class Findings:
     reducible_after: tuple[float, float]
     threshold: float
     remarks: tuple[str, ...] = ()
+    not_separable: tuple[str, ...] = ()  # what these runs can't tell apart, and what would; a line each
     trace: tuple[str, ...] = ()
     refitted_sds: dict[str, float] = field(default_factory=dict)  # absent from findings of older versions
     profile_path: str = ""  # "" where the belief came from no file

@@ -372,6 +372,8 @@ def _sections(findings: Findings, profile: str, file: Path) -> list[Section]:
                 [f"These runs say nothing of: {', '.join(findings.not_excited)}."],
             )
         )
+    if findings.not_separable:
+        made.append(Section("What these runs can't tell apart", [f"{text}." for text in findings.not_separable]))
     if findings.remarks:
         made.append(Section("Remarks", list(findings.remarks)))
     return made

@@ -39,8 +39,8 @@ and a lag of 0.45 ms at d' 45 lost a tenth of its gain to a delay."""
 
 
 LOW_SPEED_SHARE = 0.02
-"""Of a machine with more force noise than its sensors explain, no friction is an exact law: at speed, where velocities
-have a sign, dry and sub-linear friction differ by 1.2 % of their gain on a real axis. Slow reversals tell them apart."""
+"""Of a machine with more force noise than its sensors explain, no friction is an exact law: at speed, where a velocity
+has a sign, dry and sub-linear friction differ by 1.2 % of their gain on a real axis. Slow reversals tell them apart."""
 
 
 class Source(Protocol):

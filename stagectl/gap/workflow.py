@@ -15,6 +15,7 @@ from stagectl.gap.believed import Believed
 from stagectl.gap.competition import Competition
 from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.hypotheses import Term
+from stagectl.gap.identifiability import not_separable
 from stagectl.gap.log import Log
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group, Solution, solve
@@ -91,6 +92,7 @@ def find(
         parameter_errors=_parameter_errors(last, chosen, solution),
         refitted={name: value for name, (value, _) in refitted.items()},
         not_excited=first.not_excited(),
+        not_separable=tuple(one.text for one in not_separable(first.evidence.recordings)),
         unknown=unknown,
         reducible_before=before,
         reducible_after=after,
