@@ -4,6 +4,7 @@ Whoever does it, the answer is the same bit for bit: tasks come back in the orde
 is taken in one order by one place, and BLAS keeps to one thread (two threads add in another order than one).
 """
 
+import asyncio
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -119,11 +120,15 @@ class Dask:
         self._failures = _failures()
         self._lent: OrderedDict[int, tuple[object, Any]] = OrderedDict()
         try:
+            with ThreadPoolExecutor(1) as apart:  # of an event loop that the caller may be in
+                kind = apart.submit(asyncio.run, _kind_of(address, answer_s)).result()
+            if kind != "Scheduler":
+                raise ValueError(f"a {kind} does")
             self._client = distributed.Client(address, timeout=answer_s, set_as_default=False)
-        except (OSError, ValueError, TypeError, TimeoutError) as error:
+        except (OSError, ValueError, TypeError, TimeoutError, ImportError) as error:
             said = " ".join(str(error).split()) or type(error).__name__
             raise LinkError(
-                f"--dask {address}: no scheduler answers there within {answer_s:g} s ({said}); start one with "
+                f"--dask {address}: no dask scheduler answers there within {answer_s:g} s ({said}); start one with "
                 "`dask scheduler` and give the address that it prints, such as tcp://192.168.1.7:8786"
             ) from error
         try:
@@ -193,6 +198,15 @@ class Dask:
         """Let go of the cluster: what waits there for us is cancelled."""
         self._lent.clear()
         self._client.close()
+
+
+async def _kind_of(address: str, answer_s: float) -> str:
+    """Return what kind of server answers; TimeoutError where none does: a client would wait for a mute one for ever."""
+    from distributed.core import rpc
+
+    async with rpc(address, timeout=answer_s) as server:
+        identity = await asyncio.wait_for(server.identity(), 1.5 * answer_s)
+    return str(dict(identity or {}).get("type", "server of another kind"))
 
 
 def _failures() -> tuple[type[BaseException], ...]:
