@@ -8,6 +8,7 @@ from bench.figure import Bar, Figure, absent, judged
 from stagectl.errors import StagectlError
 from stagectl.gap import addition, arbiter
 from stagectl.gap.believed import Believed
+from stagectl.gap.crew import crew_of
 from stagectl.gap.findings import Findings, Named
 from stagectl.gap.inverse_dynamics import fit_inverse_dynamics
 from stagectl.gap.log import Log
@@ -22,6 +23,7 @@ TIME = Bar("EMPS: time", "s", 30.0)
 INVERSE = Bar("EMPS: inverse-dynamics fit, largest deviation from published M, Fv, Fc, offset", "%", 0.5)
 _ALL = (RIGHT, WRONG, TRAINING, HELD, LOW_SPEED, TIME, INVERSE)
 
+_WORKERS_COUNT = 2
 PITCH_M = (2.48e-3, 2.52e-3)
 _LOW_SPEED_LAWS = frozenset({"sublinear_viscous_friction", "dahl_friction", "lugre_friction"})
 
@@ -38,7 +40,8 @@ def figures(say: Say) -> Iterator[Figure]:
     believed, training, held = emps.read(folder)
     find(believed, training, held)
     begin_s = time.monotonic()
-    findings = find(believed, training, held)
+    with crew_of(_WORKERS_COUNT) as crew:
+        findings = find(believed, training, held, crew=crew)
     took_s = time.monotonic() - begin_s
     said = ", ".join(_text(one) for one in findings.named) or "nothing"
     say(f"  {took_s:.1f} s: {said}")
@@ -53,7 +56,7 @@ def figures(say: Say) -> Iterator[Figure]:
         yield _gap(LOW_SPEED, gaps_n[0])
     else:
         yield absent(LOW_SPEED, "no low-speed law was named")
-    yield judged(TIME, took_s, reason="one search, warm")
+    yield judged(TIME, took_s, reason=f"one search, warm, {_WORKERS_COUNT} workers")
     yield inverse_dynamics(training)
 
 

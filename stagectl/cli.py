@@ -146,6 +146,14 @@ FindingsProfile = Annotated[
     str | None, _option("Profile, where that of the findings is not found.", "--profile", "-p", metavar="NAME")
 ]
 GapFolder = Annotated[Path, _option("Folder of the findings.", "--out", metavar="FOLDER")]
+Workers = Annotated[
+    int | None,
+    _option("Processors of this machine to use (default: all); the answer is the same.", metavar="N", min=1),
+]
+DaskAddress = Annotated[
+    str | None,
+    _option("Scheduler of a dask.distributed cluster that does the work instead.", "--dask", metavar="ADDRESS"),
+]
 
 _PROFILE, _RUNS, _GAP = "oled-printer", Path("runs"), Path("gap")
 
@@ -336,6 +344,7 @@ def runs_plot(run: RunArgument, out: PlotPlace = None, runs: Runs = _RUNS, json:
     epilog=_epilog(
         "stagectl gap my-stage.toml 2026-11-20T09-14-03 2026-11-20T09-31-10",
         "stagectl gap profiles/observed/emps.toml lap --holdout pulses --out gap-emps",
+        "stagectl gap my-stage.toml run-1 run-2 run-3 --dask tcp://192.168.1.7:8786",
     ),
 )
 def gap_search(
@@ -345,10 +354,13 @@ def gap_search(
     out: GapFolder = _GAP,
     runs: Runs = _RUNS,
     seed: Seed = 0,
+    workers: Workers = None,
+    dask: DaskAddress = None,
     json: Json = False,
 ) -> None:
     """Experimental: find which effect the profile lacks. Names are candidates, not yet proved on the hidden suite."""
-    _deliver("gap", json, lambda voice: commands.gap.search(voice, profile, run, holdout or [], runs, out, seed))
+    work = commands.gap.search
+    _deliver("gap", json, lambda voice: work(voice, profile, run, holdout or [], runs, out, seed, workers, dask))
 
 
 @gap_app.command("apply", epilog=_epilog("stagectl gap apply my-stage.toml gap -o my-stage-2.toml --candidates"))

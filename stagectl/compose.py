@@ -9,6 +9,7 @@ import hashlib
 import importlib.util
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterable, Mapping
 from types import ModuleType
 from typing import Any
@@ -181,9 +182,16 @@ def _of(name: str) -> str:
     return f"  # {CATALOGUE[name].origin}" if CATALOGUE[name].origin else ""
 
 
+_ONE_IMPORT = threading.RLock()  # of a thread: generated modules ask for others
+
+
 def generated_module(name_hint: str, source: str) -> ModuleType:
     """Write `source` once under a hash of it in the cache folder, and import it."""
-    name = _module_name(name_hint, source)
+    with _ONE_IMPORT:  # a module that another thread is importing has no functions yet
+        return _imported(_module_name(name_hint, source), source)
+
+
+def _imported(name: str, source: str) -> ModuleType:
     if name in sys.modules:
         return sys.modules[name]
     path = CACHE_FOLDER / "generated" / f"{name}.py"

@@ -100,7 +100,7 @@ def _judge(planted: float) -> Judge:
     source = _Table([_sums(random, planted, f"run {k}") for k in range(3)])
     library = [Group((f"term {k}", "macro_force"), (k,)) for k in range(2, 7)]
     base = [Group(("base", "parameter"), (1,), prior_sds=(1.0,))]
-    judge = Judge(source, 3, base, library, lambda beside, group: group, lambda beside: lambda group: 0.0)
+    judge = Judge(source, 3, base, library, lambda _, groups: list(groups), lambda _, groups: [0.0] * len(groups))
     judge.calibrate()
     return judge
 

@@ -1,5 +1,6 @@
 """`stagectl gap`: where a model and recordings disagree, which effect is missing, and what remains."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import date
@@ -16,6 +17,7 @@ from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import addition, arbiter, findings_page, residual
 from stagectl.gap.application import Application, Change, application
 from stagectl.gap.believed import Believed, document_of, load_believed
+from stagectl.gap.crew import Dask, crew_of
 from stagectl.gap.findings import Findings, Named
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import Log, read_log
@@ -27,13 +29,24 @@ PAGE = "findings.html"
 
 
 def search(
-    voice: Voice, profile: str, training: Sequence[str], held: Sequence[str], runs_root: Path, out: Path, seed: int
+    voice: Voice,
+    profile: str,
+    training: Sequence[str],
+    held: Sequence[str],
+    runs_root: Path,
+    out: Path,
+    seed: int,
+    workers_count: int | None = None,
+    dask: str | None = None,
 ) -> Answer:
     """Compete all effects on the recordings, judge on those held out, and write what was found."""
+    if workers_count is not None and dask is not None:
+        raise RequestError("--workers is of this machine and --dask of a cluster; give one of them")
     believed = load_believed(profile)
     logs = [_log(run, runs_root, believed) for run in training]
     apart = [_log(run, runs_root, believed) for run in held]
-    findings = find(believed, logs, apart, seed=seed, say=lambda step: voice.progress(step, 0.0))
+    with Dask(dask) if dask is not None else crew_of(workers_count or len(os.sched_getaffinity(0))) as crew:
+        findings = find(believed, logs, apart, seed=seed, say=lambda step: voice.progress(step, 0.0), crew=crew)
     voice.progress.done()
     for remark in findings.remarks:
         voice.note(remark)

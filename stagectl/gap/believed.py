@@ -86,6 +86,7 @@ class Believed:
     effect_sd_ratios: dict[str, float] = field(default_factory=dict)  # by effect, where it is stated
     travel_m: float = 1.0
     own_effects: tuple[str, ...] = ()  # of the user's files
+    effect_texts: tuple[tuple[str, str], ...] = ()  # of those files, name and text: what another process declares
     source: dict[str, Any] = field(default_factory=dict)
     path: str = ""  # of the file that it was taken from, with the hash of its bytes; "" where it was none
     sha256: str = ""
@@ -188,6 +189,7 @@ def believed_of_observed(machine: ObservedMachine) -> Believed:
         effect_sd_ratio=machine.effect_sd_ratio,
         travel_m=body.travel_m,
         own_effects=tuple(name for file in machine.effect_files for name in file.names),
+        effect_texts=tuple((Path(file.file).name, file.text) for file in machine.effect_files),
         path=str(machine.source_path or ""),
         sha256=machine.sha256,
     )
@@ -235,6 +237,7 @@ def believed_of_profile(profile: Profile) -> Believed:
         effects=tuple(dict(row) for row in profile.effects),
         travel_m=profile.macro.travel_m[1] - profile.macro.travel_m[0],
         own_effects=tuple(name for file in profile.effect_files for name in file.names),
+        effect_texts=tuple((Path(file.file).name, file.text) for file in profile.effect_files),
         path=str(profile.source_path or ""),
         sha256=profile.sha256,
     )

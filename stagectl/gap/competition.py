@@ -7,13 +7,14 @@ import numpy as np
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses, seeds
 from stagectl.gap.balance import Forces, Moved, Recording
+from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.grids import free_shapes, grids_for
 from stagectl.gap.hypotheses import DEVIATION_SD, Term
 from stagectl.gap.innovations import Noise
 from stagectl.gap.noise import Explained
 from stagectl.gap.normal_equations import Group, Sums, solve
-from stagectl.gap.refinement import Refiner
+from stagectl.gap.refinement import Refiner, but_for_size, counts_at_size, gain_at_size, refined
 from stagectl.gap.selection import Judge
 
 _EXCITED_GAIN = 1e-6
@@ -33,43 +34,34 @@ class Competition:
         moved: tuple[Moved, ...] = (),
         kept: tuple[Term, ...] = (),
         noise: dict[str, Noise],
+        crew: Crew | None = None,
     ):
         """Whiten, make the columns, sum. `moved` effects are part of the recordings already, `kept` terms start."""
-        for recording in recordings:
-            balance.set_noise(recording, noise)
+        self._crew: Crew = crew or Serial()
+        self._crew.here(lambda recording: balance.set_noise(recording, noise), recordings)
         self.moved = moved
-        self.evidence = evidence = Evidence(recordings)
+        self.evidence = evidence = Evidence(recordings, self._crew)
         self.parameters = hypotheses.parameter_terms(recordings[0])
         self.curves: list[Group] = []
         self.kept: list[Group] = []
         self._sds: list[float] = []
-        base: list[Group] = []
         library: list[Group] = []
-        for term, sd in self.parameters:
-            base.append(self._taken(term, (sd,)))
-        for effect, place, values in moved:
-            base.append(self._taken(hypotheses.deviation_term(effect, place, values), (DEVIATION_SD,)))
+        base = self._taken([term for term, _ in self.parameters], [(sd,) for _, sd in self.parameters])
+        base += self._taken([hypotheses.deviation_term(*one) for one in moved], [(DEVIATION_SD,)] * len(moved))
         taken = {(effect.name, place) for effect, place, _ in moved}
         grids = grids_for(recordings)
         wrong = hypotheses.wrong_parameter_terms(recordings[0])
 
         def searched(terms: Iterable[Term]) -> list[Group]:
-            return [self._taken(term) for term in terms if term.name not in without and term.key not in taken]
+            return self._taken([term for term in terms if term.name not in without and term.key not in taken])
 
         library += searched([*wrong, *hypotheses.effect_terms(recordings, grids)])
-        self.kept += [self._taken(term) for term in kept]
-        self.curves += [self._taken(term) for term in hypotheses.curve_terms(recordings)]
+        self.kept += self._taken(kept)
+        self.curves += self._taken(list(hypotheses.curve_terms(recordings)))
         library += searched(_periodic_terms(evidence, np.array(self._sds)))
         evidence.finish(np.array([sd for _, sd in self.parameters]), nulls_count, seed)
-        self.judge = Judge(
-            evidence,
-            training_count,
-            base,
-            library,
-            lambda beside, group: Refiner(evidence, beside).refined(group),
-            lambda beside: Refiner(evidence, beside).gain_at_size,
-        )
-
+        self._refiner: tuple[tuple[int, ...], Refiner] | None = None
+        self.judge = Judge(evidence, training_count, base, library, self._refined, self._gains_at_size)
         self.judge.modelled = self._modelled()
         self.judge.is_rough = any(level.white_force_n > 0.0 for level in noise.values())
 
@@ -83,23 +75,55 @@ class Competition:
         columns = [g.columns[0] for (t, _), g in zip(self.parameters, self.judge.base, strict=False) if t.name in dry]
         return float(sum(s.gram[c, c] for s in self.evidence.sums for c in columns))
 
-    def _taken(self, term: Term, sds: tuple[float, ...] | None = None) -> Group:
-        """Take a hypothesis in; without `sds` its amplitudes may be as large as its effect can be."""
-        known = sds is not None
-        sds = sds if sds is not None else _widest(term)
-        self._sds += sds
-        searched = 0
-        if not known and term.name in CATALOGUE:
-            searched = max(len(free_shapes(CATALOGUE[term.name])) - (0 if term.linear else 1), 0)
-        return Group(
-            term.key,
-            self.evidence.add(term),
-            term.scope,
-            sds,
-            term.bounds,
-            searched,
-            self.evidence.places_count(term.scope),
+    def _taken(self, terms: Sequence[Term], sds: Sequence[tuple[float, ...]] | None = None) -> list[Group]:
+        """Take hypotheses in; without `sds` their amplitudes may be as large as their effects can be."""
+        groups = []
+        priors = [_widest(term) for term in terms] if sds is None else sds
+        for term, columns, prior in zip(terms, self.evidence.add(terms), priors, strict=True):
+            self._sds += prior
+            searched = 0
+            if sds is None and term.name in CATALOGUE:
+                searched = max(len(free_shapes(CATALOGUE[term.name])) - (0 if term.linear else 1), 0)
+            places_count = self.evidence.places_count(term.scope)
+            groups.append(Group(term.key, columns, term.scope, prior, term.bounds, searched, places_count))
+        return groups
+
+    def _beside(self, groups: Sequence[Group]) -> Refiner:
+        """Return what searches beside some groups; the last one is kept, gains and shapes are asked of the same."""
+        state = tuple(column for group in groups for column in group.columns)
+        if self._refiner is None or self._refiner[0] != state:
+            self._refiner = state, Refiner(self.evidence, groups)
+        return self._refiner[1]
+
+    def _refined(self, beside: Sequence[Group], groups: Sequence[Group]) -> list[Group]:
+        """Return groups at their best shapes, as new columns; a group itself where nothing is to be searched."""
+        outcomes = self._crew.map(
+            refined, (self.evidence, self._beside(beside)), [self.term(group) for group in groups]
         )
+        terms = [outcome[0] for outcome in outcomes if outcome is not None]
+        columns = iter(self._crew.here(self.evidence.columns_of, terms))
+        found = []
+        for group, outcome in zip(groups, outcomes, strict=True):
+            if outcome is None:
+                found.append(group)
+                continue
+            term, count = outcome
+            found.append(self.evidence.append(term, next(columns), _widest(term), max(group.searched, count)))
+        return found
+
+    def _gains_at_size(self, beside: Sequence[Group], groups: Sequence[Group]) -> list[float]:
+        """Return what groups gain at their size; what a grid has at several sizes is asked for once."""
+        asked = {
+            group.columns: but_for_size(self.term(group))
+            for group in groups
+            if counts_at_size(self.evidence, self.term(group))
+        }
+        if not asked:
+            return [0.0] * len(groups)
+        terms = {asked[group.columns]: self.term(group) for group in groups if group.columns in asked}
+        gains = self._crew.map(gain_at_size, (self.evidence, self._beside(beside)), terms.values())
+        found = dict(zip(terms, gains, strict=True))
+        return [found[asked[group.columns]] if group.columns in asked else 0.0 for group in groups]
 
     def term(self, group: Group) -> Term:
         """Return what a group stands for."""

@@ -4,13 +4,17 @@ Most hypotheses move one body only, so a column is kept channel by channel, and 
 the products of the whole table. Pure.
 """
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from stagectl import effect_text
 from stagectl.gap import balance
 from stagectl.gap.balance import Recording
+from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Sums
 
@@ -20,6 +24,9 @@ INNOVATIONS = 0
 _REST_PASSES = 3
 _HIGH_SHARE = 0.3  # of the sample rate: above it forces move nothing
 _LEAST_SCALE = 0.5
+
+_KEPT_BYTES = 400e6
+"""Columns of trials at their size are kept up to here, first come: a rank asks for the same ones beside others."""
 
 Columns = list[list[np.ndarray | None]]
 """By recording, by channel: (amplitudes, rows) of a term, None where it is zero."""
@@ -41,20 +48,56 @@ class Channel:
         return here, np.stack([self.rows[at[wanted[place]]] for place in here]) if here else None
 
 
-class Evidence:
-    """All columns of all recordings, growing as hypotheses get new ones."""
+class Origin(NamedTuple):
+    """Where a recording comes from: amplitudes may belong to its session, or to it alone."""
 
-    def __init__(self, recordings: Sequence[Recording]):
-        """Begin with the innovations alone."""
+    session: str
+    run: str
+
+
+class Evidence:
+    """All columns of all recordings, growing as hypotheses get new ones.
+
+    In another process it begins with the innovations, and takes those columns in that are asked for there.
+    """
+
+    def __init__(self, recordings: Sequence[Recording], crew: Crew | None = None):
+        """Begin with the innovations alone; `crew` does what is to be done for many terms or recordings."""
         self.recordings = recordings
+        self.crew: Crew = crew or Serial()
         self.terms: dict[int, Term] = {}
         self.sums: list[Sums] = []
-        self.channels: list[list[Channel]] = []
         self._count = 1
-        for recording in recordings:
-            names = [name for name, _ in balance.channels(recording)]
-            observed = balance.observed(recording)
-            self.channels.append([Channel(name, [INNOVATIONS], [z]) for name, z in zip(names, observed, strict=True)])
+        self.channels: list[list[Channel]] = self.crew.here(_innovations_of, recordings)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._kept: dict[object, Columns] = {}
+        self._kept_bytes = 0
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave behind what another process makes for itself: columns, their sums, quantities along the motion."""
+        return {
+            "recordings": [replace(recording, known={}) for recording in self.recordings],
+            "channels": [
+                [replace(one, numbers=[INNOVATIONS], rows=one.rows[:1]) for one in channels]
+                for channels in self.channels
+            ],
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin in another process, where the user's own effects may be unknown yet."""
+        self.recordings, self.channels = state["recordings"], state["channels"]
+        for title, text in self.recordings[0].believed.effect_texts:
+            effect_text.declare(text, title)
+        self.crew, self.terms, self.sums, self._count = Serial(), {}, [], 1
+        self._begin()
+
+    @property
+    def origins(self) -> list[Origin]:
+        """Session and run of each recording."""
+        return [Origin(recording.log.session, recording.log.name) for recording in self.recordings]
 
     def places_count(self, scope: str) -> int:
         """Return how many amplitudes of its own a term of this scope has for each of its columns."""
@@ -69,13 +112,48 @@ class Evidence:
             found.append([_stacked([part[c] for part in parts], channel.scale) for c, channel in enumerate(channels)])
         return found
 
-    def add(self, term: Term) -> tuple[int, ...]:
-        """Take the columns of a term in, before anything is summed."""
-        return self._keep(term, self.columns_of(term))
+    def columns_of_trial(self, term: Term) -> Columns:
+        """Return the columns of a term that is looked at beside other groups again."""
+        key = (term.key, tuple(term.shape.items()))
+        with self._lock:
+            kept = self._kept.get(key)
+        if kept is not None:
+            return kept
+        columns = self.columns_of(term)
+        size = sum(part.nbytes for parts in columns for part in parts if part is not None)
+        with self._lock:
+            if key not in self._kept and self._kept_bytes + size <= _KEPT_BYTES:
+                self._kept[key] = columns
+                self._kept_bytes += size
+        return columns
+
+    def forget_trials(self) -> None:
+        """Give back what is kept of trials."""
+        with self._lock:
+            self._kept, self._kept_bytes = {}, 0
+
+    def add(self, terms: Iterable[Term]) -> list[tuple[int, ...]]:
+        """Take the columns of terms in, before anything is summed; returns their numbers, term by term."""
+        terms = list(terms)
+        return [
+            self._keep(term, columns)
+            for term, columns in zip(terms, self.crew.here(self.columns_of, terms), strict=True)
+        ]
+
+    def hold(self, terms: Mapping[int, Term]) -> None:
+        """Take the columns of terms in that are not here yet, under the numbers that they have elsewhere."""
+        with self._lock:
+            for first, term in terms.items():
+                if first not in self.terms:
+                    self._put(term, self.columns_of(term), first)
 
     def _keep(self, term: Term, columns: Columns) -> tuple[int, ...]:
-        numbers = tuple(range(self._count, self._count + len(term.amplitudes)))
+        numbers = self._put(term, columns, self._count)
         self._count += len(numbers)
+        return numbers
+
+    def _put(self, term: Term, columns: Columns, first: int) -> tuple[int, ...]:
+        numbers = tuple(range(first, first + len(term.amplitudes)))
         for channels, parts in zip(self.channels, columns, strict=True):
             for channel, part in zip(channels, parts, strict=True):
                 if part is not None:
@@ -115,22 +193,28 @@ class Evidence:
         whatever nobody explains; beside the whole library, some columns of which hold measured accelerations, it came
         out a tenth too small.
         """
+
+        def summed(k: int) -> Sums:
+            return self._summed(k, known_sds, nulls_count, np.random.default_rng([seed, k]))
+
+        self.sums += self.crew.here(summed, range(len(self.recordings)))
+
+    def _summed(self, k: int, known_sds: np.ndarray, nulls_count: int, random: np.random.Generator) -> Sums:
+        """Scale the channels of one recording and sum them."""
         size = self._count
-        for k, (recording, channels) in enumerate(zip(self.recordings, self.channels, strict=True)):
-            random = np.random.default_rng([seed, k])
-            gram, nulls, count = np.zeros((size, size)), np.zeros((nulls_count, size - 1)), 0
-            for c, channel in enumerate(channels):
-                left = self.rest(k, c, known_sds)
-                power = np.abs(np.fft.rfft(left)) ** 2 / left.size
-                high = np.fft.rfftfreq(left.size) > _HIGH_SHARE
-                channel.scale = max(float(np.sqrt(np.mean(power[high]))), _LEAST_SCALE)
-                rows = np.stack(channel.rows) / channel.scale
-                channel.rows = list(rows)
-                gram[np.ix_(channel.numbers, channel.numbers)] += rows @ rows.T
-                at = np.array(channel.numbers[1:], dtype=int) - 1
-                nulls[:, at] += random.standard_normal((nulls_count, left.size)) @ rows[1:].T
-                count += left.size
-            self.sums.append(Sums(gram, float(count), recording.log.session, recording.log.name, nulls))
+        gram, nulls, count = np.zeros((size, size)), np.zeros((nulls_count, size - 1)), 0
+        for c, channel in enumerate(self.channels[k]):
+            left = self.rest(k, c, known_sds)
+            power = np.abs(np.fft.rfft(left)) ** 2 / left.size
+            high = np.fft.rfftfreq(left.size) > _HIGH_SHARE
+            channel.scale = max(float(np.sqrt(np.mean(power[high]))), _LEAST_SCALE)
+            rows = np.stack(channel.rows) / channel.scale
+            channel.rows = list(rows)
+            gram[np.ix_(channel.numbers, channel.numbers)] += rows @ rows.T
+            at = np.array(channel.numbers[1:], dtype=int) - 1
+            nulls[:, at] += random.standard_normal((nulls_count, left.size)) @ rows[1:].T
+            count += left.size
+        return Sums(gram, float(count), *self.origins[k], nulls)
 
     def append(self, term: Term, columns: Columns, prior_sds: tuple[float, ...], searched: int) -> Group:
         """Add the columns of a term to all products; returns them as a group."""
@@ -151,6 +235,11 @@ class Evidence:
             nulls = np.hstack([s.nulls, np.zeros((s.nulls.shape[0], len(numbers)))])
             self.sums[k] = replace(s, gram=np.block([[s.gram, cross], [cross.T, own]]), nulls=nulls)
         return Group(term.key, numbers, term.scope, prior_sds, term.bounds, searched, self.places_count(term.scope))
+
+
+def _innovations_of(recording: Recording) -> list[Channel]:
+    names = [name for name, _ in balance.channels(recording)]
+    return [Channel(name, [INNOVATIONS], [z]) for name, z in zip(names, balance.observed(recording), strict=True)]
 
 
 def _stacked(parts: list[np.ndarray | None], scale: float) -> np.ndarray | None:

@@ -6,6 +6,7 @@ Pure.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -40,63 +41,80 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
     joint = believed.joint
     found: list[tuple[Term, float]] = []
 
-    def known(name: str, sd: float, forces: Callable[[Recording], Forces]) -> None:
-        found.append((Term(name, "parameter", {}, ("error_ratio",), lambda r: [forces(r)]), sd))
+    def known(name: str, sd: float, forces: Callable[[Recording], list[Forces]], unit: str = "error_ratio") -> None:
+        found.append((Term(name, "parameter", {}, (unit,), forces), sd))
 
-    # a = f / m: a mass that is wrong by a ratio scales what is known to act. Taken as m times the measured acceleration
-    # it would, together with the force constant, shrink every rest that nobody explains: a fit that collapses.
-    def inertia(axis: str) -> Callable[[Recording], Forces]:
-        def of(r: Recording) -> Forces:
-            known = balance.known_forces(r)
-            share = r.belief(axis).mass_kg / r.mass_kg(axis)  # a payload is known
-            if axis == "macro":
-                return Forces(macro_n=None if known.macro_n is None else -share * known.macro_n)
-            return Forces(end_n=None if known.end_n is None else -share * known.end_n)
-
-        return of
-
-    known("macro_mass_kg", believed.macro.mass_sd_kg / believed.macro.mass_kg, inertia("macro"))
-    known("macro_force_constant", believed.macro.force_constant_sd_ratio, lambda r: Forces(macro_n=r.macro_command_n))
+    known("macro_mass_kg", believed.macro.mass_sd_kg / believed.macro.mass_kg, partial(_inertia, "macro"))
+    known("macro_force_constant", believed.macro.force_constant_sd_ratio, _macro_motor)
     if believed.micro is not None and recording.end is not None:
-        known("micro_mass_kg", believed.micro.mass_sd_kg / believed.micro.mass_kg, inertia("end"))
-
-        def micro_motor(r: Recording) -> Forces:
-            return Forces() if r.micro_command_n is None else balance.motor_forces(r, "end", r.micro_command_n, None)
-
-        known("micro_force_constant", believed.micro.force_constant_sd_ratio, micro_motor)
+        known("micro_mass_kg", believed.micro.mass_sd_kg / believed.micro.mass_kg, partial(_inertia, "end"))
+        known("micro_force_constant", believed.micro.force_constant_sd_ratio, _micro_motor)
     if joint is not None and recording.end is not None:
-        known("spring_n_per_m", joint.stiffness_sd_ratio, _joint(lambda r: -joint.spring_n_per_m * _relative_m(r)))
-        known("damping_n_s_per_m", joint.damping_sd_ratio, _joint(lambda r: -joint.damping_n_s_per_m * _rate(r)))
+        known("spring_n_per_m", joint.stiffness_sd_ratio, partial(_spring, joint.spring_n_per_m))
+        known("damping_n_s_per_m", joint.damping_sd_ratio, partial(_damping, joint.damping_n_s_per_m))
         for side, sign in (("left", -1.0), ("right", 1.0)):
             stiffness = getattr(joint, f"{side}_stiffness_n_per_m")
-
-            def push(r: Recording, sign: float = sign, stiffness: float = stiffness) -> np.ndarray:
-                depth_m = 0.0 if r.penetration_m is None else r.penetration_m
-                return np.where(r.side == sign, sign * stiffness * depth_m, 0.0)
-
-            def edge(r: Recording, sign: float = sign, stiffness: float = stiffness) -> np.ndarray:
-                return np.where(r.side == sign, -sign * stiffness, 0.0)
-
-            known(f"{side}_stiffness_n_per_m", getattr(joint, f"{side}_stiffness_sd_ratio"), _joint(push))
-            found.append((Term(f"{side}_m", "parameter", {}, ("error_m",), _as_list(_joint(edge))), joint.width_sd_m))
+            sd = getattr(joint, f"{side}_stiffness_sd_ratio")
+            known(f"{side}_stiffness_n_per_m", sd, partial(_push, sign, stiffness))
+            known(f"{side}_m", joint.width_sd_m, partial(_edge, sign, stiffness), "error_m")
     for axis, side in (("macro", "macro"), ("end", "micro")):
         if axis in recording.axes:
             belief = recording.belief(axis)
-            found.append((_timing(f"{side}_latch_s", axis, 0.0), belief.latch_sd_s))
+            known(f"{side}_latch_s", belief.latch_sd_s, partial(_timing, axis, 0.0), "error_s")
             if belief.current_loop_s > 0.0:
-                found.append((_timing(f"{side}_current_loop_s", axis, belief.current_loop_s), belief.current_loop_sd_s))
+                lag = partial(_timing, axis, belief.current_loop_s)
+                known(f"{side}_current_loop_s", belief.current_loop_sd_s, lag, "error_s")
     for row in believed.effects:
-        effect = CATALOGUE[row["name"]]
-        values = [row[name] for name in effect.parameters]
-
-        def existing(
-            r: Recording, effect: Effect = effect, place: str = row["acts_on"], values: list[float] = values
-        ) -> Forces:
-            return balance.effect_forces(r, effect, place, values)
-
         name = f"{row['name']} on {row['acts_on']}"
-        known(name, believed.effect_sd_ratios.get(name, believed.effect_sd_ratio), existing)
+        values = [row[parameter] for parameter in CATALOGUE[row["name"]].parameters]
+        sd = believed.effect_sd_ratios.get(name, believed.effect_sd_ratio)
+        known(name, sd, partial(_existing, row["name"], row["acts_on"], values))
     return found
+
+
+# What terms are made of: functions with a name, not closures, so that a term can go to another process.
+
+
+def _inertia(axis: str, r: Recording) -> list[Forces]:
+    """Return what a mass is off by: a = f / m, so a ratio scales what is known to act; a payload is known.
+
+    Taken as m times the measured acceleration it would, together with the force constant, shrink every rest that
+    nobody explains: a fit that collapses.
+    """
+    known = balance.known_forces(r)
+    share = r.belief(axis).mass_kg / r.mass_kg(axis)
+    if axis == "macro":
+        return [Forces(macro_n=None if known.macro_n is None else -share * known.macro_n)]
+    return [Forces(end_n=None if known.end_n is None else -share * known.end_n)]
+
+
+def _macro_motor(r: Recording) -> list[Forces]:
+    return [Forces(macro_n=r.macro_command_n)]
+
+
+def _micro_motor(r: Recording) -> list[Forces]:
+    return [Forces() if r.micro_command_n is None else balance.motor_forces(r, "end", r.micro_command_n, None)]
+
+
+def _spring(stiffness_n_per_m: float, r: Recording) -> list[Forces]:
+    return _joint(-stiffness_n_per_m * _relative_m(r))
+
+
+def _damping(damping_n_s_per_m: float, r: Recording) -> list[Forces]:
+    return _joint(-damping_n_s_per_m * _rate(r))
+
+
+def _push(sign: float, stiffness_n_per_m: float, r: Recording) -> list[Forces]:
+    depth_m = 0.0 if r.penetration_m is None else r.penetration_m
+    return _joint(np.where(r.side == sign, sign * stiffness_n_per_m * depth_m, 0.0))
+
+
+def _edge(sign: float, stiffness_n_per_m: float, r: Recording) -> list[Forces]:
+    return _joint(np.where(r.side == sign, -sign * stiffness_n_per_m, 0.0))
+
+
+def _existing(name: str, place: str, values: list[float], r: Recording) -> list[Forces]:
+    return [balance.effect_forces(r, CATALOGUE[name], place, values)]
 
 
 _WRONG_RATIO = 0.3
@@ -119,14 +137,16 @@ def wrong_parameter_terms(recording: Recording) -> Iterator[Term]:
             yield free(name, term.forces, _WRONG_RATIO if not name.startswith(("contact_", "viscous_")) else 1.0)
     for name, parts in _BOTH_SIDES.items():
         if all(part in terms for part in parts):
+            together = partial(_together, tuple(terms[part].forces for part in parts))
+            yield free(name, together, _WRONG_M if name.endswith("_m") else _WRONG_RATIO)
 
-            def both(r: Recording, parts: tuple[str, ...] = parts) -> list[Forces]:
-                total = Forces()
-                for part in parts:
-                    balance.add(total, terms[part].forces(r)[0])
-                return [total]
 
-            yield free(name, both, _WRONG_M if name.endswith("_m") else _WRONG_RATIO)
+def _together(parts: tuple[Callable[[Recording], list[Forces]], ...], r: Recording) -> list[Forces]:
+    """Return the first forces of each part, added."""
+    total = Forces()
+    for part in parts:
+        balance.add(total, part(r)[0])
+    return [total]
 
 
 _BOTH_SIDES = {
@@ -149,35 +169,22 @@ def terms_unit(name: str) -> str:
 _TIMING_STEP_S = 5e-6
 
 
-def _timing(name: str, axis: str, lag_s: float) -> Term:
+def _timing(axis: str, lag_s: float, r: Recording) -> list[Forces]:
     """Return the error of a delay (`lag_s` = 0) or of a lag, in seconds, by a difference over a small step."""
-
-    def forces(r: Recording) -> list[Forces]:
-        h, belief = r.log.period_s, r.belief(axis)
-        command_n = r.log.macro_command_n if axis == "macro" else r.log.micro_command_n
-        if command_n is None:
-            return [Forces()]
-        latch_s, loop_s = belief.latch_s, belief.current_loop_s
-
-        step_s = _TIMING_STEP_S
-        now = driven(command_n, latch_s, loop_s, h)
-        later = driven(command_n, latch_s + (0.0 if lag_s else step_s), loop_s + (step_s if lag_s else 0.0), h)
-        slope, slope_at = ((after - before) / step_s for before, after in zip(now, later, strict=True))
-        return [balance.motor_forces(r, axis, slope, slope_at / belief.force_constant_n_per_a)]
-
-    return Term(name, "parameter", {}, ("error_s",), forces)
+    h, belief = r.log.period_s, r.belief(axis)
+    command_n = r.log.macro_command_n if axis == "macro" else r.log.micro_command_n
+    if command_n is None:
+        return [Forces()]
+    latch_s, loop_s = belief.latch_s, belief.current_loop_s
+    step_s = _TIMING_STEP_S
+    now = driven(command_n, latch_s, loop_s, h)
+    later = driven(command_n, latch_s + (0.0 if lag_s else step_s), loop_s + (step_s if lag_s else 0.0), h)
+    slope, slope_at = ((after - before) / step_s for before, after in zip(now, later, strict=True))
+    return [balance.motor_forces(r, axis, slope, slope_at / belief.force_constant_n_per_a)]
 
 
-def _as_list(forces: Callable[[Recording], Forces]) -> Callable[[Recording], list[Forces]]:
-    return lambda r: [forces(r)]
-
-
-def _joint(force_on_end: Callable[[Recording], np.ndarray]) -> Callable[[Recording], Forces]:
-    def of(r: Recording) -> Forces:
-        force_n = force_on_end(r)
-        return Forces(macro_n=-force_n, end_n=force_n)
-
-    return of
+def _joint(force_on_end_n: np.ndarray) -> list[Forces]:
+    return [Forces(macro_n=-force_on_end_n, end_n=force_on_end_n)]
 
 
 def _relative_m(r: Recording) -> np.ndarray:
@@ -254,9 +261,7 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
     if not linear:
         settings, amplitudes = [dict(shape)], ["share_of_shape_ratio"]
 
-    def forces(r: Recording) -> list[Forces]:
-        return [_everywhere(r, effect, place, [values[name] for name in effect.parameters]) for values in settings]
-
+    forces = partial(_at_settings, effect.name, place, [[row[name] for name in effect.parameters] for row in settings])
     scope = _scope(effect, [name for name in linear] or [effect.parameters[0]])
     bounds = (
         tuple((-high, high) for high in (effect.bounds[name.removesuffix("*")][1] for name in amplitudes))
@@ -269,13 +274,16 @@ def term_of(effect: Effect, place: str, shape: dict[str, float]) -> Term:
 def term_at_size(effect: Effect, place: str, parameters: dict[str, float]) -> Term:
     """Make the term of one effect with all its parameters given; its one amplitude should come out as one."""
     values = [parameters[name] for name in effect.parameters]
-
-    def forces(r: Recording) -> list[Forces]:
-        return [_everywhere(r, effect, place, values, whole=True)]
-
+    forces = partial(_at_settings, effect.name, place, [values], whole=True)
     shape = {name: parameters[name] for name in effect.parameters}
     scope = _scope(effect, [effect.parameters[0]])
     return Term(effect.name, place, shape, ("share_of_shape_ratio",), forces, scope, (_SHARE_BOUNDS,), linear=False)
+
+
+def _at_settings(
+    name: str, place: str, settings: list[list[float]], r: Recording, *, whole: bool = False
+) -> list[Forces]:
+    return [_everywhere(r, CATALOGUE[name], place, values, whole=whole) for values in settings]
 
 
 def _scope(effect: Effect, amplitudes: list[str]) -> str:
@@ -295,13 +303,15 @@ def deviation_term(effect: Effect, place: str, parameters: dict[str, float]) -> 
     now = [parameters[name] for name in effect.parameters]
     later = [now[0] * (1.0 + _STEP_RATIO), *now[1:]]
 
-    def forces(r: Recording) -> list[Forces]:
-        here, there = (balance.effect_forces(r, effect, place, values) for values in (now, later))
-        return [balance.scaled(there, 1.0 / _STEP_RATIO, balance.scaled(here, -1.0 / _STEP_RATIO, Forces()))]
-
+    forces = partial(_slope, effect.name, place, now, later)
     return Term(
         effect.name, place, dict(parameters), ("error_ratio",), forces, "structural", ((-0.9, 2.0),), linear=False
     )
+
+
+def _slope(name: str, place: str, now: list[float], later: list[float], r: Recording) -> list[Forces]:
+    here, there = (balance.effect_forces(r, CATALOGUE[name], place, values) for values in (now, later))
+    return [balance.scaled(there, 1.0 / _STEP_RATIO, balance.scaled(here, -1.0 / _STEP_RATIO, Forces()))]
 
 
 _SHARE_BOUNDS = (0.0, 3.0)
@@ -346,15 +356,15 @@ def curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
                 continue
             knots = np.linspace(low, high, _KNOTS_COUNT)
 
-            def forces(
-                r: Recording, axis: str = axis, quantity: str = quantity, knots: np.ndarray = knots
-            ) -> list[Forces]:
-                value = balance.quantities(r, axis, "macro_force")[quantity]
-                hats = [np.interp(value, knots, np.eye(_KNOTS_COUNT)[k]) for k in range(_KNOTS_COUNT)]
-                return [Forces(macro_n=hat) if axis == "macro" else Forces(end_n=hat) for hat in hats]
-
+            forces = partial(_hats, axis, quantity, knots)
             place = "macro_force" if axis == "macro" else "micro_force"
             names = tuple(f"{knot:.6g}" for knot in knots)
             commands = [r.log.macro_command_n if axis == "macro" else r.log.micro_command_n for r in recordings]
             most_n = max(_LEAST_CURVE_N, *(float(np.std(c)) for c in commands if c is not None))
             yield Term(f"curve over {quantity}", place, {}, names, forces, bounds=((-most_n, most_n),) * _KNOTS_COUNT)
+
+
+def _hats(axis: str, quantity: str, knots: np.ndarray, r: Recording) -> list[Forces]:
+    value = balance.quantities(r, axis, "macro_force")[quantity]
+    hats = [np.interp(value, knots, np.eye(knots.size)[k]) for k in range(knots.size)]
+    return [Forces(macro_n=hat) if axis == "macro" else Forces(end_n=hat) for hat in hats]

@@ -6,11 +6,22 @@ Pure.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 _JITTER = 1e-10
 _BOUND_SDS = 2.0
+
+
+class Placed(Protocol):
+    """What comes from one recording."""
+
+    @property
+    def session(self) -> str: ...
+
+    @property
+    def run(self) -> str: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +196,7 @@ class Fold:
         return total
 
 
-def covers(scope: str, s: Sums) -> bool:
+def covers(scope: str, s: Placed) -> bool:
     """Tell whether an amplitude of a scope reaches a recording."""
     return scope in ("", f"session {s.session}", f"run {s.run}")
 

@@ -5,8 +5,9 @@ solved for at each point (variable projection, Golub and Pereyra 1973). Effects 
 edge that moves by more than the stage touches) are searched in all their parameters, at their size. Pure.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any, Self
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -16,7 +17,7 @@ from stagectl.gap import balance, hypotheses
 from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.grids import free_shapes
 from stagectl.gap.hypotheses import Term
-from stagectl.gap.normal_equations import Group, Sums, active_slots, covers, normal_of
+from stagectl.gap.normal_equations import Group, Placed, active_slots, covers, normal_of
 
 _SWEEPS = 2
 _BRACKET = 2.2  # from the grid's place, up and down
@@ -31,11 +32,13 @@ _WORST = 1e300
 
 
 class Refiner:
-    """Searches the shapes of single terms beside groups that stay as they are."""
+    """Searches the shapes of single terms beside groups that stay as they are.
+
+    It travels without recordings and columns: `on` gives them back to it where it works.
+    """
 
     def __init__(self, evidence: Evidence, beside: Sequence[Group]):
         """Eliminate `beside` once; every trial costs its own columns only."""
-        self._evidence = evidence
         self._slots, precision = active_slots(beside, evidence.sums)
         normal, right = normal_of(self._slots, precision, evidence.sums)
         scale = np.sqrt(np.diag(normal))
@@ -43,21 +46,37 @@ class Refiner:
         weights = np.outer(scale, scale)
         self._inverse = np.linalg.inv(normal / weights + 1e-10 * np.eye(scale.size)) / weights
         self._values = self._inverse @ right
-        self._active = []  # by recording: slots that reach it, and by channel which of them are not zero, their rows
-        for s, channels in zip(evidence.sums, evidence.channels, strict=True):
-            here = [k for k, (_, scope) in enumerate(self._slots) if covers(scope, s)]
-            wanted = [self._slots[k][0] for k in here]
-            self._active.append((here, [channel.of(wanted) for channel in channels]))
+        self._terms = {group.columns[0]: evidence.terms[group.columns[0]] for group in beside}
+        self._attach(evidence)
 
-    def refined(self, group: Group) -> Group:
-        """Return the group at its best shape, as new columns; the same group where nothing is to be searched."""
-        term = self._evidence.terms[group.columns[0]]
+    def _attach(self, evidence: Evidence) -> None:
+        active = []  # by recording: slots that reach it, and by channel which of them are not zero, their rows
+        for origin, channels in zip(evidence.origins, evidence.channels, strict=True):
+            here = [k for k, (_, scope) in enumerate(self._slots) if covers(scope, origin)]
+            wanted = [self._slots[k][0] for k in here]
+            active.append((here, [channel.of(wanted) for channel in channels]))
+        self._active = active
+        self._evidence = evidence
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the recordings and their columns behind."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_evidence", "_active")}
+
+    def on(self, evidence: Evidence) -> Self:
+        """Return this, at work on the evidence of this process."""
+        if "_evidence" not in self.__dict__:
+            evidence.hold(self._terms)
+            self._attach(evidence)
+        return self
+
+    def refined(self, term: Term) -> tuple[Term, int] | None:
+        """Return the term at its best shape, and how many numbers were searched; None where there are none."""
         if term.acts_on == "parameter":
-            return group
+            return None
         free = free_shapes(CATALOGUE[term.name])
         entire = whole_of(term)
         if not free and not entire:
-            return group
+            return None
         if entire:
             term = self._at_size(term)
             free = tuple(dict.fromkeys((*CATALOGUE[term.name].parameters[:1], *free)))
@@ -72,23 +91,20 @@ class Refiner:
             stated_s = _LATCH_SDS * self._evidence.recordings[0].belief(_axis(found)).latch_sd_s
             least = stated_s / shape[CATALOGUE[found.name].parameters[0]]
             found = replace(found, bounds=((max(found.bounds[0][0], least), found.bounds[0][1]),))
-        columns = self._evidence.columns_of(found)
-        priors = tuple(max(abs(low), abs(high)) for low, high in found.bounds)
-        searched = max(group.searched, len(free) - (0 if found.linear else 1))
-        return self._evidence.append(found, columns, priors, searched)
+        return found, len(free) - (0 if found.linear else 1)
 
-    def gain_at_size(self, group: Group) -> float:
+    def gain_at_size(self, term: Term) -> float:
         """Return what a hypothesis gains at the best of a few sizes, where its column is of no use: in contact."""
-        term = self._evidence.terms[group.columns[0]]
-        touching = any(r.side is not None and bool(np.any(r.side)) for r in self._evidence.recordings)
-        if not touching or not term.acts_on.endswith(("_sensor", "contact_edge")) or not whole_of(term):
-            return 0.0
-        return self._gain(self._at_size(term))
+        return max(self._gain(trial, self._evidence.columns_of_trial) for trial in self._trials(term))
 
     def _at_size(self, term: Term) -> Term:
-        """Take an amplitude into the shape: the best of those that move readings or edges by some micrometres.
+        """Take an amplitude into the shape: the best of some."""
+        return max(self._trials(term), key=lambda trial: self._gain(trial, self._evidence.columns_of_trial))
 
-        Elsewhere, the best of a few steps about what the column asks for.
+    def _trials(self, term: Term) -> list[Term]:
+        """Return a term at amplitudes that move readings or edges by some micrometres.
+
+        Elsewhere, at a few steps about what the column asks for.
         """
         effect = CATALOGUE[term.name]
         amplitude = effect.parameters[0]
@@ -103,12 +119,11 @@ class Refiner:
         else:
             asked = float(self._amplitudes(self._evidence.columns_of(term), term)[0])
             sizes = [step * max(asked, 0.02) * term.shape[amplitude] for step in _STEPS]
-        trials = [
+        return [
             hypotheses.term_at_size(effect, term.acts_on, shape | {amplitude: size})
             for size in sizes
             if low <= size <= high
         ]
-        return max(trials, key=self._gain)
 
     def _line(
         self, term: Term, shape: dict[str, float], name: str, best: float, narrow: float
@@ -151,10 +166,10 @@ class Refiner:
             return shape | {name: float(outcome.x)}, float(-outcome.fun)
         return shape, best
 
-    def _gain(self, term: Term) -> float:
+    def _gain(self, term: Term, columns_of: Callable[[Term], Columns] | None = None) -> float:
         """Return what a term gains beside the others; at its size without any freedom of its own."""
         try:
-            columns = self._evidence.columns_of(term)
+            columns = (columns_of or self._evidence.columns_of)(term)
         except (FloatingPointError, ValueError):
             return -_WORST
         normal, right = self._reduced(columns, term)
@@ -174,16 +189,16 @@ class Refiner:
 
     def _reduced(self, columns: Columns, term: Term) -> tuple[np.ndarray, np.ndarray]:
         """Return (normal matrix, right side) of a term's amplitudes with everything beside it eliminated."""
-        sums = self._evidence.sums
-        places = scopes_of(term.scope, sums)
+        origins = self._evidence.origins
+        places = scopes_of(term.scope, origins)
         width = len(term.amplitudes)
         size = width * len(places)
         normal, right = np.zeros((size, size)), np.zeros(size)
         cross = np.zeros((len(self._slots), size))
-        for s, channels, (here, active), parts in zip(
-            sums, self._evidence.channels, self._active, columns, strict=True
+        for origin, channels, (here, active), parts in zip(
+            origins, self._evidence.channels, self._active, columns, strict=True
         ):
-            at = next(k for k, scope in enumerate(places) if covers(scope, s))
+            at = next(k for k, scope in enumerate(places) if covers(scope, origin))
             mine = slice(at * width, (at + 1) * width)
             for channel, (present, rows), part in zip(channels, active, parts, strict=True):
                 if part is None:
@@ -195,7 +210,29 @@ class Refiner:
         return normal - cross.T @ self._inverse @ cross, right - cross.T @ self._values
 
 
-def scopes_of(scope: str, sums: Sequence[Sums]) -> tuple[str, ...]:
+def gain_at_size(evidence: Evidence, refiner: Refiner, term: Term) -> float:
+    """Do one task of a crew: see Refiner.gain_at_size."""
+    return refiner.on(evidence).gain_at_size(term)
+
+
+def refined(evidence: Evidence, refiner: Refiner, term: Term) -> tuple[Term, int] | None:
+    """Do one task of a crew: see Refiner.refined."""
+    return refiner.on(evidence).refined(term)
+
+
+def counts_at_size(evidence: Evidence, term: Term) -> bool:
+    """Tell whether the column of a term is of no use, because what it moves decides about contact."""
+    touching = any(r.side is not None and bool(np.any(r.side)) for r in evidence.recordings)
+    return touching and term.acts_on.endswith(("_sensor", "contact_edge")) and whole_of(term)
+
+
+def but_for_size(term: Term) -> tuple[str, str, tuple[tuple[str, float], ...]]:
+    """Return what tells a term from others of its effect when its size is searched: name, place, the other shapes."""
+    size = CATALOGUE[term.name].parameters[0]
+    return *term.key, tuple((name, value) for name, value in term.shape.items() if name != size)
+
+
+def scopes_of(scope: str, sums: Sequence[Placed]) -> tuple[str, ...]:
     """Return the places that amplitudes of a scope belong to."""
     if scope == "session":
         return tuple(sorted({f"session {s.session}" for s in sums}))

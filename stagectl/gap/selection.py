@@ -49,8 +49,11 @@ class Source(Protocol):
     sums: list[Sums]
 
 
-Refine = Callable[[Sequence[Group], Group], Group]
-"""(groups beside it, a group of the grid) -> the same hypothesis at its best shape."""
+Refine = Callable[[Sequence[Group], Sequence[Group]], list[Group]]
+"""(groups beside them, groups of the grid) -> the same hypotheses, each at its best shape."""
+
+GainsAtSize = Callable[[Sequence[Group], Sequence[Group]], list[float]]
+"""(groups beside them, groups of the grid) -> what each gains at its size, 0 where its column tells."""
 
 
 @dataclass(slots=True)
@@ -62,7 +65,7 @@ class Judge:
     base: list[Group]
     library: list[Group]
     refine: Refine
-    gain_at_size: Callable[[Sequence[Group]], Callable[[Group], float]]
+    gains_at_size: GainsAtSize
     threshold: float = 0.0
     modelled: float = (
         0.0  # what laws of the model explain already that are known to be inexact, in squares of the noise
@@ -150,20 +153,19 @@ class Judge:
 
     def _ranked(self, chosen: Sequence[Group], most: int) -> list[Group]:
         """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
-        fold = Fold([*self.base, *chosen], self.source.sums, self.source.sums, on_noise=False)
+        beside = [*self.base, *chosen]
+        fold = Fold(beside, self.source.sums, self.source.sums, on_noise=False)
         best: dict[tuple[str, str], tuple[float, Group]] = {}
         taken = {group.key for group in chosen}
-        at_size = self.gain_at_size([*self.base, *chosen])
-        for group in self.library:
-            if group.key in taken:
-                continue
-            gain = max(float(fold.added(group)[0][0]), at_size(group))
+        open_ones = [group for group in self.library if group.key not in taken]
+        for group, at_size in zip(open_ones, self.gains_at_size(beside, open_ones), strict=True):
+            gain = max(float(fold.added(group)[0][0]), at_size)
             worth = gain - self.price() * group.complexity
             if group.key not in best or worth > best[group.key][0]:
                 best[group.key] = (worth, group)
         ranked = [group for _, group in sorted(best.values(), key=lambda row: -row[0])]
         possible = (group for group in ranked[: 4 * most] if self._allowed([*chosen, group]))
-        return [self.refine([*self.base, *chosen], group) for group in itertools.islice(possible, most)]
+        return self.refine(beside, list(itertools.islice(possible, most)))
 
     def _note(self, chosen: Sequence[Group], rivals: Sequence[Group]) -> None:
         now = self.gains(chosen)

@@ -5,6 +5,7 @@ Pure.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.balance import Moved, Recording
 from stagectl.gap.competition import Competition
+from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.findings import Named
 from stagectl.gap.hypotheses import DEVIATION_SD
@@ -24,7 +26,7 @@ _EDGE_SDS = 2.0
 
 
 def settled(
-    recordings: list[Recording], noise: dict[str, Noise], moved: tuple[Moved, ...] = ()
+    recordings: list[Recording], noise: dict[str, Noise], moved: tuple[Moved, ...] = (), crew: Crew | None = None
 ) -> tuple[list[Recording], tuple[Moved, ...]]:
     """Put the joint's edges, and effects that move it, where the recordings have them; returns both as they are then.
 
@@ -33,19 +35,20 @@ def settled(
     """
     if not any(r.side is not None and bool(np.any(r.side)) for r in recordings):
         return recordings, moved
+    crew = crew or Serial()
     out_m = {"left": 0.0, "right": 0.0}
     there = recordings
     for _ in range(_EDGE_PASSES):
-        there = [balance.with_edges_moved(r, out_m["left"], out_m["right"]) for r in recordings]
-        there = [balance.operating_point(r, moved) for r in there] if moved else there
-        for recording in there:
-            balance.set_noise(recording, noise)
-        evidence = Evidence(there)
+        there = crew.here(partial(_put, out_m, moved), recordings)
+        crew.here(lambda recording: balance.set_noise(recording, noise), there)
+        evidence = Evidence(there, crew)
         parameters = hypotheses.parameter_terms(there[0])
-        base = [Group(t.key, evidence.add(t), t.scope, (sd,), t.bounds) for t, sd in parameters]
-        for one in moved:
-            term = hypotheses.deviation_term(*one)
-            base.append(Group(term.key, evidence.add(term), term.scope, (DEVIATION_SD,), term.bounds))
+        terms = [term for term, _ in parameters] + [hypotheses.deviation_term(*one) for one in moved]
+        sds = [sd for _, sd in parameters] + [DEVIATION_SD] * len(moved)
+        base = [
+            Group(term.key, columns, term.scope, (sd,), term.bounds)
+            for term, columns, sd in zip(terms, evidence.add(terms), sds, strict=True)
+        ]
         evidence.finish(np.array([sd for _, sd in parameters]), 0, 0)
         solution = solve(base, evidence.sums)
         moved = tuple(
@@ -58,8 +61,13 @@ def settled(
                 out_m[side] = float(np.clip(out_m[side] + solution.of(group)[0][0], -_EDGE_SDS * sd, _EDGE_SDS * sd))
         if not moved and max(abs(out) for out in out_m.values()) >= _EDGE_SDS * _edge_sd_m(there[0]):
             return recordings, moved  # something else pulls at them
-    there = [balance.with_edges_moved(r, out_m["left"], out_m["right"]) for r in recordings]
-    return [balance.operating_point(r, moved) for r in there] if moved else there, moved
+    return crew.here(partial(_put, out_m, moved), recordings), moved
+
+
+def _put(out_m: dict[str, float], moved: tuple[Moved, ...], recording: Recording) -> Recording:
+    """Return a recording with edges further out, and with effects that move the joint taken out."""
+    there = balance.with_edges_moved(recording, out_m["left"], out_m["right"])
+    return balance.operating_point(there, moved) if moved else there
 
 
 def _edge_sd_m(recording: Recording) -> float:

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from stagectl import effect_text
 from stagectl.effects import CATALOGUE
-from stagectl.errors import RequestError
+from stagectl.errors import RequestError, StagectlError
 from stagectl.gap import balance, hypotheses, plausibility
 from stagectl.gap.believed import Believed
 from stagectl.gap.competition import Competition
+from stagectl.gap.crew import Crew, Serial, one_blas_thread
 from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.identifiability import not_separable
@@ -37,22 +39,68 @@ def find(
     seed: int = 0,
     without: frozenset[str] = frozenset(),
     say: Say = lambda text: None,
+    crew: Crew | None = None,
 ) -> Findings:
     """Find what is missing from a believed machine, `without` some effects of the library.
 
-    Errors: RequestError where a log is on both sides, or recordings can't be of this machine (`plausibility`).
+    crew: who does the work, see `stagectl.gap.crew`; None is this thread. The answer is the same whoever does it.
+    Errors: RequestError where a log is on both sides, or recordings can't be of this machine (`plausibility`); what the
+    crew raises.
     """
+    with one_blas_thread():
+        return _found(believed, training, held, nulls_count, seed, without, say, crew or Serial())
+
+
+Recordings = tuple[Sequence[Log], Sequence[Log]]
+"""What one search takes: recordings to learn from, recordings that no fit sees."""
+
+
+def find_many(
+    believed: Believed, sets: Sequence[Recordings], crew: Crew | None = None, *, nulls_count: int = 200, seed: int = 0
+) -> list[Findings | StagectlError]:
+    """Search many sets of recordings of one machine or of machines of one kind, each on its own, in their order.
+
+    A cluster gets one task a set. What is wrong with a set stands in its place; errors of the crew itself are raised.
+    """
+    crew = crew or Serial()
+    if crew.is_elsewhere:
+        return crew.map(_one_of_many, (believed, nulls_count, seed), sets)
+    return [_one_of_many(believed, nulls_count, seed, one, crew) for one in sets]
+
+
+def _one_of_many(
+    believed: Believed, nulls_count: int, seed: int, one: Recordings, crew: Crew | None = None
+) -> Findings | StagectlError:
+    for title, text in believed.effect_texts:  # unknown yet in another process
+        effect_text.declare(text, title)
+    try:
+        return find(believed, *one, nulls_count=nulls_count, seed=seed, crew=crew)
+    except StagectlError as error:
+        return error
+
+
+def _found(
+    believed: Believed,
+    training: Sequence[Log],
+    held: Sequence[Log],
+    nulls_count: int,
+    seed: int,
+    without: frozenset[str],
+    say: Say,
+    crew: Crew,
+) -> Findings:
     if {log.name for log in training} & {log.name for log in held}:
         raise RequestError("a recording is both training and holdout; give recordings that no fit sees as --holdout")
     logs = [*training, *held]
     say("reading the motion")
     remarks = plausibility.check_logs(believed, training, held)
-    recordings = [balance.recording_of(log, believed) for log in logs]
-    plausibility.check_recordings(believed, recordings)
-    noise = noise_of(recordings)
-    unsettled = recordings
-    recordings, _ = settled(unsettled, noise)
-    first = Competition(recordings, len(training), nulls_count=nulls_count, seed=seed, without=without, noise=noise)
+    unsettled = crew.here(lambda log: balance.recording_of(log, believed), logs)
+    plausibility.check_recordings(believed, unsettled)
+    noise = noise_of(unsettled)
+    recordings, _ = settled(unsettled, noise, crew=crew)
+    first = Competition(
+        recordings, len(training), nulls_count=nulls_count, seed=seed, without=without, noise=noise, crew=crew
+    )
     judge = first.judge
     say(f"{len(judge.library)} hypotheses of {len({g.key for g in judge.library})} names on {len(logs)} recordings")
     judge.calibrate()
@@ -66,11 +114,16 @@ def find(
         moved = tuple(moved_by(first, chosen, group) for group in moving)
         still = [group for group in chosen if group not in moving]
         explained = first.explained(still)
-        there, moved = settled(unsettled, noise, moved)
-        there = [balance.foretold_under(r, balance.sum_of(balance.known_forces(r), explained(r))) for r in there]
+        first.evidence.forget_trials()
+        there, moved = settled(unsettled, noise, moved, crew)
+        there = crew.here(
+            lambda r: balance.foretold_under(r, balance.sum_of(balance.known_forces(r), explained(r))), there
+        )
         noise = noise_of(there, explained)
         kept = tuple(first.term(group) for group in still)
-        last = Competition(there, len(training), seed=seed, without=without, moved=moved, kept=kept, noise=noise)
+        last = Competition(
+            there, len(training), seed=seed, without=without, moved=moved, kept=kept, noise=noise, crew=crew
+        )
         last.judge.threshold = judge.threshold
         last.judge.trace = judge.trace
         chosen = last.judge.select(last.kept)

@@ -1,0 +1,202 @@
+"""Whoever does the work of a gap search, the answer is the same: this thread, two threads, a cluster of two workers."""
+
+import dataclasses
+import os
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from bench.blind_sets import load_set
+from stagectl.commands import gap
+from stagectl.errors import LinkError, RequestError
+from stagectl.gap.believed import load_believed
+from stagectl.gap.crew import Dask, Serial, Threads, crew_of, one_blas_thread
+from stagectl.gap.log import Log
+from stagectl.gap.workflow import find, find_many
+from tests.blind import generate
+
+SEED, DURATION_S = 117, 1.5  # two axes that touch; one sensor reads late, which moves the joint
+LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+
+
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory):
+    """A small set as a user hands it over."""
+    folder = tmp_path_factory.mktemp("set")
+    generate.write(generate.draw(SEED, None, DURATION_S), folder)
+    return load_set(folder)
+
+
+@pytest.fixture(scope="module")
+def serial(blind):
+    """What one thread finds in it."""
+    return _found(blind, Serial())
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two worker processes on this machine."""
+    distributed = pytest.importorskip("distributed", reason="the extra fleet is not installed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **LOCAL) as local:
+        yield local
+
+
+def _found(blind, crew):
+    return find(blind.believed, blind.logs[:1], blind.logs[1:2], nulls_count=20, crew=crew)
+
+
+def test_two_threads_find_the_same_to_the_last_bit(blind, serial):
+    with Threads(2) as crew:
+        assert dataclasses.asdict(_found(blind, crew)) == dataclasses.asdict(serial)
+
+
+def test_a_cluster_finds_the_same_to_the_last_bit(blind, serial, cluster):
+    assert serial.named, serial.trace  # something was searched, so something had to travel
+    with Dask(cluster.scheduler_address) as crew:
+        assert dataclasses.asdict(_found(blind, crew)) == dataclasses.asdict(serial)
+
+
+def _process(number: int) -> tuple[int, int]:
+    return number, os.getpid()
+
+
+def test_tasks_of_a_cluster_are_done_elsewhere_and_come_back_in_order(cluster):
+    with Dask(cluster.scheduler_address) as crew:
+        done = crew.map(_process, (), range(20))
+    assert [number for number, _ in done] == list(range(20))
+    assert os.getpid() not in {process for _, process in done}
+
+
+def test_many_sets_are_found_in_their_order_and_a_wrong_one_stands_in_its_place(blind, serial, cluster):
+    log, other = blind.logs[:2]
+    sets = [([log], [log]), ([log], [other])]
+    with Dask(cluster.scheduler_address) as crew:
+        wrong, right = find_many(blind.believed, sets, crew, nulls_count=20)
+    assert right == serial
+    assert isinstance(wrong, RequestError)
+    assert "both training and holdout" in str(wrong)
+
+
+# ---- a law of the user's own --------------------------------------------------------------------------------------
+
+BUMP = (
+    "import numpy as np\nfrom stagectl.effects import effect\n\n\n"
+    '@effect(places=("macro_force",), force_n=(-100.0, 100.0), width_m=(1e-3, 9e-3), linear=("force_n",), '
+    'symptom="a hill at zero", reference="this test")\n'
+    "def hill_of_this_process(position_m, force_n, width_m):\n"
+    '    """A hill in the guide: F = A / (1 + (x / w)^2)."""\n'
+    "    ratio = position_m / width_m\n    return force_n / (1.0 + ratio * ratio)\n"
+)
+OBSERVED = """name = "axis"
+effect_files = ["hill.py"]
+[cycle]
+rate_hz = 1000.0
+latch_s = 0.0
+[macro]
+mass_kg = 40.2
+mass_sd_kg = 0.4
+travel_m = 0.1
+[sensor]
+noise_m = 5e-9
+"""
+
+
+def _log(name: str, seed: int) -> Log:
+    """An axis of 40 kg on a hill of 3 N, 5 mm wide, under a controller of its own; semi-implicit."""
+    random = np.random.default_rng(seed)
+    h, count, parts = 1e-3, 3000, 10
+    t = np.arange(count) * h
+    reference = 0.02 * np.sin(2.0 * np.pi * (0.4 + 0.1 * seed) * t) + 0.004 * np.sin(2.0 * np.pi * 2.3 * t + seed)
+    speed = np.gradient(reference, h)
+    x, v, seen, command = reference[0], speed[0], np.zeros(count), np.zeros(count)
+    for k in range(count):
+        seen[k] = x + 5e-9 * random.standard_normal()
+        command[k] = 4.0e4 * (reference[k] - seen[k]) + 2.5e3 * (speed[k] - v)
+        for _ in range(parts):
+            v += (command[k] + 3.0 / (1.0 + (x / 5e-3) ** 2)) / 40.0 * h / parts
+            x += v * h / parts
+    return Log(name, h, seen, command, np.ones(count, bool), "1", reference_m=reference)
+
+
+def test_a_users_own_law_goes_to_the_workers_as_text(tmp_path, cluster):
+    (tmp_path / "hill.py").write_text(BUMP)
+    (tmp_path / "axis.toml").write_text(OBSERVED)
+    believed = load_believed(tmp_path / "axis.toml")
+    logs = [_log("run 1", 1), _log("run 2", 2)]
+    with Dask(cluster.scheduler_address) as crew:
+        findings = find(believed, logs[:1], logs[1:], nulls_count=20, crew=crew)
+        (again,) = find_many(believed, [(logs[:1], logs[1:])], crew, nulls_count=20)
+    assert [effect.name for effect in findings.named] == ["hill_of_this_process"], findings.trace
+    assert again == findings
+
+
+# ---- what is refused, and what stays behind -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("address", ["nonsense", "udp://127.0.0.1:8786"])
+def test_an_address_that_is_none_is_said_with_what_would_be_one(address):
+    pytest.importorskip("distributed", reason="the extra fleet is not installed")
+    with pytest.raises(LinkError, match=rf"--dask {address}: no dask scheduler .* such as tcp://"):
+        Dask(address)
+
+
+def test_a_server_that_says_nothing_is_not_waited_for():
+    pytest.importorskip("distributed", reason="the extra fleet is not installed")
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        with pytest.raises(LinkError, match=rf"{address}: no dask scheduler answers there within 0.3 s"):
+            Dask(address, answer_s=0.3)
+
+
+def test_a_cluster_without_workers_is_said():
+    distributed = pytest.importorskip("distributed", reason="the extra fleet is not installed")
+    with (
+        distributed.LocalCluster(n_workers=0, **LOCAL) as empty,
+        pytest.raises(LinkError, match=r"has no worker after 0\.3 s; start one with `dask worker tcp://"),
+    ):
+        Dask(empty.scheduler_address, answer_s=0.3)
+
+
+def test_no_worker_at_all_is_refused():
+    with pytest.raises(RequestError, match="0 workers do nothing; give 1 or more"):
+        crew_of(0)
+
+
+def test_workers_of_this_machine_and_a_cluster_exclude_each_other(tmp_path):
+    with pytest.raises(RequestError, match="give one of them"):
+        gap.search(None, "axis", [], [], tmp_path, tmp_path, 0, 2, "tcp://127.0.0.1:8786")
+
+
+def test_after_an_interrupt_nothing_begins_any_more():
+    begun, count = [], 500
+
+    def task(number: int) -> None:
+        begun.append(number)
+        if number == 0:
+            raise KeyboardInterrupt
+        time.sleep(0.02)
+
+    with pytest.raises(KeyboardInterrupt), Threads(2) as crew:
+        crew.here(task, range(count))
+    for thread in threading.enumerate():
+        if thread.name.startswith("gap_"):
+            thread.join(10.0)
+            assert not thread.is_alive()
+    assert len(begun) < count
+
+
+def test_blas_gets_its_threads_back_when_the_last_one_ends():
+    from threadpoolctl import threadpool_info
+
+    def counts():
+        return [row["num_threads"] for row in threadpool_info() if row["user_api"] == "blas"]
+
+    before = counts()
+    with one_blas_thread():
+        with one_blas_thread():
+            assert set(counts()) == {1}
+        assert set(counts()) == {1}
+    assert counts() == before
