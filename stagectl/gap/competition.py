@@ -79,7 +79,7 @@ class Competition:
         """Take hypotheses in; without `sds` their amplitudes may be as large as their effects can be."""
         groups = []
         priors = [_widest(term) for term in terms] if sds is None else sds
-        for term, columns, prior in zip(terms, self.evidence.add(terms), priors, strict=True):
+        for term, columns, prior in zip(terms, self.evidence.add_all(terms), priors, strict=True):
             self._sds += prior
             searched = 0
             if sds is None and term.name in CATALOGUE:

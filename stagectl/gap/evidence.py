@@ -132,7 +132,11 @@ class Evidence:
         with self._lock:
             self._kept, self._kept_bytes = {}, 0
 
-    def add(self, terms: Iterable[Term]) -> list[tuple[int, ...]]:
+    def add(self, term: Term) -> tuple[int, ...]:
+        """Take the columns of a term in, before anything is summed; returns their numbers."""
+        return self._keep(term, self.columns_of(term))
+
+    def add_all(self, terms: Iterable[Term]) -> list[tuple[int, ...]]:
         """Take the columns of terms in, before anything is summed; returns their numbers, term by term."""
         terms = list(terms)
         return [

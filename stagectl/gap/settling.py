@@ -47,7 +47,7 @@ def settled(
         sds = [sd for _, sd in parameters] + [DEVIATION_SD] * len(moved)
         base = [
             Group(term.key, columns, term.scope, (sd,), term.bounds)
-            for term, columns, sd in zip(terms, evidence.add(terms), sds, strict=True)
+            for term, columns, sd in zip(terms, evidence.add_all(terms), sds, strict=True)
         ]
         evidence.finish(np.array([sd for _, sd in parameters]), 0, 0)
         solution = solve(base, evidence.sums)
