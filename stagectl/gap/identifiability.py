@@ -145,7 +145,7 @@ class _Table:
         """Return the columns of a term, made where they are asked for first."""
         key = (term.key, tuple(sorted(term.shape.items())), term.amplitudes)
         if key not in self._groups:
-            self._groups[key] = Group(term.key, self._evidence.add([term])[0], term.scope)
+            self._groups[key] = Group(term.key, self._evidence.add(term), term.scope)
         return self._groups[key]
 
     def _products(self, number: int, known_sds: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ _BRACKET = 2.2  # from the grid's place, up and down
 _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one turn over the travel
 _ANCHOR_M = 1.0
 _NEAR_ZERO = 0.05
-_LATCH_SDS = 2.0
+LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)
 _MOVED_M = (0.3e-6, 1e-6, 3e-6, 10e-6, 30e-6, 100e-6)
 _TOLERANCE_RATIO = 3e-3
@@ -88,7 +88,7 @@ class Refiner:
         found = _with_shape(term, shape)
         if Trait.LATE_READING in CATALOGUE[found.name].traits and not found.linear:
             # what a latch may be off by is no effect of a sensor
-            stated_s = _LATCH_SDS * self._evidence.recordings[0].belief(_axis(found)).latch_sd_s
+            stated_s = LATCH_SDS * self._evidence.recordings[0].belief(_axis(found)).latch_sd_s
             least = stated_s / shape[CATALOGUE[found.name].parameters[0]]
             found = replace(found, bounds=((max(found.bounds[0][0], least), found.bounds[0][1]),))
         return found, len(free) - (0 if found.linear else 1)

@@ -26,6 +26,10 @@ NAMING_RATIO = 1.75
 on development sets in which nothing was missing the best one gained up to 1.3 times the quantile; an effect at twice
 its detection limit (d' = 10) gains four times as much."""
 
+CONTRADICTION = 4.0
+"""Loss on recordings that no fit saw from which they speak against a hypothesis; one that they don't excite costs them
+what its size is uncertain by (chi square of one number)."""
+
 RIVALS_COUNT = 6
 """Names whose shapes are searched in each round."""
 
@@ -213,7 +217,7 @@ class Judge:
         return chosen
 
     def _stays(self, chosen: Sequence[Group], group: Group) -> bool:
-        """Tell whether a hypothesis gains beyond noise, on both kinds of recordings, more than it costs, and enough."""
+        """Tell whether a hypothesis gains beyond noise, more than it costs, enough, and nothing speaks against it."""
         now, gains = self.gains(chosen), self.gains([*chosen, group])
         trained, apart = gains[0] - now[0], gains[1] - now[1]
         whole = self.gain([*chosen, group])
@@ -223,7 +227,7 @@ class Judge:
         gained = whole - self.gain(chosen)
         return (
             trained > 0.0
-            and apart > 0.0
+            and apart > -CONTRADICTION
             and gained > max(self._threshold_of(group), least, self.price() * group.complexity)
         )
 

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from stagectl.effects import CATALOGUE
+from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.balance import Moved, Recording
 from stagectl.gap.competition import Competition
@@ -19,10 +19,11 @@ from stagectl.gap.findings import Named
 from stagectl.gap.hypotheses import DEVIATION_SD
 from stagectl.gap.innovations import Noise
 from stagectl.gap.normal_equations import Group, solve
-from stagectl.gap.refinement import whole_of
+from stagectl.gap.refinement import LATCH_SDS, whole_of
 
 _EDGE_PASSES = 3
 _EDGE_SDS = 2.0
+_LEAST_SDS = 5.0
 
 
 def settled(
@@ -113,3 +114,14 @@ def remeasured(
         parameters = {**values, name: size * (1.0 + float(value[0]))}
         found.append(replace(before, parameters=parameters, sds={name: abs(size) * float(sd[0])}))
     return tuple(found)
+
+
+def stands(one: Named, recording: Recording) -> bool:
+    """Tell whether an effect that was measured at its size is anything: beyond its deviation, and what is stated."""
+    effect = CATALOGUE[one.name]
+    name = effect.parameters[0]
+    least = _LEAST_SDS * one.sds[name]
+    if Trait.LATE_READING in effect.traits:
+        axis = "macro" if one.acts_on.startswith("macro") else "end"
+        least = max(least, LATCH_SDS * recording.belief(axis).latch_sd_s)
+    return abs(one.parameters[name]) > least

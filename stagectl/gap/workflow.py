@@ -21,11 +21,12 @@ from stagectl.gap.identifiability import not_separable
 from stagectl.gap.log import Log
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group, Solution, solve
-from stagectl.gap.settling import moved_by, moves_joint, remeasured, settled
+from stagectl.gap.settling import moved_by, moves_joint, remeasured, settled, stands
 
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
 _CURVE_SHARE = 0.03
+_SECOND_PASSES = 2
 
 Say = Callable[[str], None]
 
@@ -108,26 +109,44 @@ def _found(
     before = judge.reducible([])
     chosen = judge.select(until=lambda group: moves_joint(first, group))
     last, named = first, _all_named(first, chosen)
-    moving = [group for group in chosen if moves_joint(first, group)]
-    if chosen:
+    found = chosen
+    for _ in range(_SECOND_PASSES):
+        if not found:
+            break
         say("once more, along the motion and at the place where the joint is now known to be")
-        moved = tuple(moved_by(first, chosen, group) for group in moving)
-        still = [group for group in chosen if group not in moving]
+        moving = [group for group in found if moves_joint(first, group)]
+        moved = tuple(moved_by(first, found, group) for group in moving)
+        still = [group for group in found if group not in moving]
         explained = first.explained(still)
         first.evidence.forget_trials()
         there, moved = settled(unsettled, noise, moved, crew)
         there = crew.here(
-            lambda r: balance.foretold_under(r, balance.sum_of(balance.known_forces(r), explained(r))), there
+            lambda r, explained=explained: balance.foretold_under(
+                r, balance.sum_of(balance.known_forces(r), explained(r))
+            ),
+            there,
         )
-        noise = noise_of(there, explained)
         kept = tuple(first.term(group) for group in still)
         last = Competition(
-            there, len(training), seed=seed, without=without, moved=moved, kept=kept, noise=noise, crew=crew
+            there,
+            len(training),
+            seed=seed,
+            without=without,
+            moved=moved,
+            kept=kept,
+            noise=noise_of(there, explained),
+            crew=crew,
         )
         last.judge.threshold = judge.threshold
         last.judge.trace = judge.trace
         chosen = last.judge.select(last.kept)
-        named = (remeasured(last, chosen, named, moved) if moved else ()) + _all_named(last, chosen)
+        at_size = remeasured(last, chosen, _all_named(first, found), moved) if moved else ()
+        named = at_size + _all_named(last, chosen)
+        gone = {(one.name, one.acts_on) for one in at_size if not stands(one, there[0])}
+        if not gone:
+            break
+        found = [group for group in found if group.key not in gone]  # at its size it is nothing
+        last, chosen, named = first, found, _all_named(first, found)
     after = last.judge.reducible(chosen)
     unknown = _unknown(last, chosen, before_excess=_excess(first, []))
     verdict = "unknown" if unknown is not None else "found" if named else "nothing"
