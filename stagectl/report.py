@@ -93,6 +93,7 @@ class Report:
     """A page: title, banner (what to know before reading any number), facts, links, tables, figures, sections.
 
     links: (file beside the page, what it is). The page is whole without them.
+    parts: what comes before the tables, in the order given, for a page that goes from chapter to chapter.
     """
 
     title: str
@@ -102,6 +103,7 @@ class Report:
     facts: Sequence[tuple[str, str]] = field(default=())
     sections: Sequence[Section] = ()
     links: Sequence[tuple[str, str]] = ()
+    parts: Sequence[Table | Figure | Section] = ()
 
     def html(self) -> str:
         """Render the page."""
@@ -115,9 +117,15 @@ class Report:
             f'<p class="link"><a href="{html.escape(quote(file))}">{html.escape(said)}</a></p>'
             for file, said in self.links
         ]
-        parts += [_table_html(table) for table in self.tables]
-        parts += [_figure_html(figure, number) for number, figure in enumerate(self.figures, 1)]
-        parts += [_section_html(section) for section in self.sections]
+        figures_count = 0
+        for part in (*self.parts, *self.tables, *self.figures, *self.sections):
+            if isinstance(part, Table):
+                parts.append(_table_html(part))
+            elif isinstance(part, Section):
+                parts.append(_section_html(part))
+            else:
+                figures_count += 1
+                parts.append(_figure_html(part, figures_count))
         return _PAGE.format(title=html.escape(self.title), style=_page_style(), body="\n".join(parts))
 
     def write(self, path: str | Path) -> None:
