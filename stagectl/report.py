@@ -157,10 +157,7 @@ def _table_html(table: Table) -> str:
     for row in table.rows:
         if len(row) != len(table.columns):
             raise RequestError(f"table '{table.title}': {len(row)} cells under {len(table.columns)} headings")
-    numeric = [
-        bool(table.rows) and all(isinstance(row[i], Quantity) or row[i] == "" for row in table.rows)
-        for i in range(len(table.columns))
-    ]
+    numeric = [_is_numeric([row[i] for row in table.rows if row[i] != ""]) for i in range(len(table.columns))]
     marks = [' class="n"' if right else "" for right in numeric]
     head = "".join(f"<th{mark}>{html.escape(name)}</th>" for name, mark in zip(table.columns, marks, strict=True))
     body = "\n".join(
@@ -172,6 +169,11 @@ def _table_html(table: Table) -> str:
         f'<section><h2>{html.escape(table.title)}</h2><div class="scroll"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>\n{body}\n</tbody></table></div>{note}</section>"
     )
+
+
+def _is_numeric(cells: Sequence[str | Quantity]) -> bool:
+    """Tell a column of quantities, in which a word may stand here and there ("diverges")."""
+    return 2 * sum(isinstance(cell, Quantity) for cell in cells) > len(cells)
 
 
 def _cell(table: Table, cell: str | Quantity, mark: str) -> str:

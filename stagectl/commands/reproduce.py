@@ -38,7 +38,9 @@ def show(voice: Voice, section: str | None, out: Path) -> Answer:
         "missing": list(missing),
         "page": str(out / PAGE),
     }
-    shown = [part for chapter in chapters for part in (f"\n[bold]{chapter.section}. {chapter.title}[/]", _table(chapter))]
+    shown = [
+        part for chapter in chapters for part in (f"\n[bold]{chapter.section}. {chapter.title}[/]", _table(chapter))
+    ]
     return Answer(data, [*shown, *(f"not yet: {what}" for what in missing), f"page: {out / PAGE}"])
 
 

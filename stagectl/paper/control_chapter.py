@@ -7,7 +7,7 @@ from stagectl.paper.cases import SETTLED_S, stable_range_m
 from stagectl.paper.closed_loop import Run
 from stagectl.paper.figures import CORRECTED, FOURTH, PRINTED, REFERENCE, Curve, Panel, drawn
 from stagectl.paper.printed_values import MICRO_SUPPLY_V
-from stagectl.paper.rows import Chapter, Row
+from stagectl.paper.rows import Chapter, Row, pair
 from stagectl.report import Figure
 
 _NEAR_ZERO_RATIO = 0.01  # of the stroke: an error relative to less is no number
@@ -37,10 +37,18 @@ def chapter() -> Chapter:
         weak, fair = cases.printed_pid(name), cases.fair_pid(name)
         printed, ideal = (cases.printed_sliding(name, ideal=which) for which in (False, True))
         corrected = cases.corrected_sliding(name)
-        rows += _case_rows(name, "A", "PID", weak, fair, "as printed P_w = 0.4 V/m is no control: the micro is dragged; "
-                           "corrected: a triple pole at 10 Hz, no compensation (A')")
-        rows += _case_rows(name, "B", "DSMC", printed, corrected, "as printed at 1 ms with L_w = 2.52 mH, which (29) "
-                           "leaves out")
+        rows += _case_rows(
+            name,
+            "A",
+            "PID",
+            weak,
+            fair,
+            "as printed P_w = 0.4 V/m is no control: the micro is dragged; "
+            "corrected: a triple pole at 10 Hz, no compensation (A')",
+        )
+        rows += _case_rows(
+            name, "B", "DSMC", printed, corrected, "as printed at 1 ms with L_w = 2.52 mH, which (29) leaves out"
+        )
         rows += _range_rows(name, "B", "DSMC without L_w, at 50 us", ideal, None, "the artefact of y(e): about 3/4 phi")
         if name == "sine":
             rows.append(_rest_row())
@@ -55,11 +63,13 @@ def chapter() -> Chapter:
         [
             "Same platform for all: 7.5 mm of gap to each side, K2 = 500 N/m, voltage drives, macro servo of 8 Hz with "
             "feed-forward; P_h is a gain on its position command. Positions and velocities are known as they are.",
-            "As printed means the corrected platform under the printed law: (2) and (5) as printed are shown in their own "
+            "As printed means the corrected platform under the printed law: (2) and (5) as printed are shown "
+            "in their own "
             "chapters.",
             "The stage begins on the reference unless said: x_ref1 begins at 0.375 m/s.",
             "x_ref2 is printed as a picture: 1 s rest, 0.8 m at 0.2 m/s with corners of 0.33 m/s², 4 s rest, and back.",
-            "Average positioning error: mean |e / d_r| where |d_r| is above 1 % of its peak; the paper doesn't define it.",
+            "Average positioning error: mean |e / d_r| where |d_r| is above 1 % of its peak; the paper "
+            "doesn't define it.",
             "Supplies are not printed: 300 V and 48 V. The joint is damped with 300 N s/m.",
         ],
     )
@@ -71,11 +81,11 @@ def chapter() -> Chapter:
 def _range_rows(name: str, case: str, label: str, printed: Run, corrected: Run | None, remark: str) -> list[Row]:
     ours = stable_range_m(printed)
     better = (None, None) if corrected is None else stable_range_m(corrected)
+    figure, paper = f"Fig. {_NUMBER[case]}, {case}", _PAPER_RANGE_M[name, case]
     return [
-        Row(f"Fig. {_NUMBER[case]}, {case}", f"{name}: {label}: {which} error", "m", _PAPER_RANGE_M[name, case][k], ours[k],
-            better[k], remark if k == 0 else "")
+        Row(figure, f"{name}: {label}: {which} error", "m", paper[k], ours[k], better[k], remark if k == 0 else "")
         for k, which in enumerate(("least", "greatest"))
-    ]  # fmt: skip
+    ]
 
 
 def _case_rows(name: str, case: str, label: str, printed: Run, corrected: Run, remark: str) -> list[Row]:
@@ -114,12 +124,12 @@ def _rest_row() -> Row:
             cases.corrected_sliding("sine", begins_at_rest=True),
         )
     ]
-    return Row(
+    return pair(
         "Fig. 16, B",
         "sine: DSMC from rest, 0.375 m/s behind: largest error after 8 s",
         "m",
         22e-6,
-        *peaks,
+        peaks,
         "the printed surface is undamped: what the start leaves swings on, into the edges of the gap",
     )
 

@@ -68,4 +68,4 @@ def along(
     b = backlash.init(profile, forgetting_ratio=forgetting_ratio)
     out = np.empty((end_position_m.size, 4))
     _along(b, belief, macro_position_m, end_position_m, spring_n_per_m, damping_n_s_per_m, out)
-    return Gated(*(out[:, k] for k in range(4)), float(b["left_sd_m"][0]), float(b["right_sd_m"][0]))
+    return Gated(out[:, 0], out[:, 1], out[:, 2], out[:, 3], float(b["left_sd_m"][0]), float(b["right_sd_m"][0]))

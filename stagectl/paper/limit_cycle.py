@@ -13,7 +13,7 @@ no servo for Fig. 10; this one shows what "also called the limit-cycle phenomeno
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from stagectl.compiled import compiled
 from stagectl.paper import plant_as_printed
@@ -62,22 +62,19 @@ def predicted(
     rates = np.geomspace(0.05, 300.0, 4000)
     values = np.array([imaginary(float(rate)) for rate in rates])
     for k in np.flatnonzero(np.diff(np.sign(values)) != 0.0):
-        rate = float(brentq(imaginary, rates[k], rates[k + 1]))
+        rate = float(root_scalar(imaginary, bracket=(rates[k], rates[k + 1])).root)
         wanted = -1.0 / _compliance(rate, servo, macro_kg, micro_kg).real
         if 0.0 < wanted < stiffness_n_per_m:
-            amplitude = brentq(
+            amplitude = root_scalar(
                 lambda a, n=wanted: describing_function(a, half_gap_m, stiffness_n_per_m) - n,
-                half_gap_m * (1.0 + 1e-9),
-                half_gap_m * 1e6,
-            )
+                bracket=(half_gap_m, half_gap_m * 1e6),
+            ).root
             return Cycle(float(amplitude), rate / (2.0 * np.pi))
     return None
 
 
 @compiled
-def _run(
-    state: np.ndarray, plant: np.ndarray, w2: float, wi3: float, c: float, dt_s: float, out: np.ndarray
-) -> None:
+def _run(state: np.ndarray, plant: np.ndarray, w2: float, wi3: float, c: float, dt_s: float, out: np.ndarray) -> None:
     s, q = state[0], plant[0]
     integral = 0.0
     for k in range(out.size):

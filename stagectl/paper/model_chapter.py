@@ -224,7 +224,9 @@ def _displacement_figure(
             Panel(
                 "against no joint (mm)",
                 [
-                    Curve("as printed", literal.t_s, 1e3 * (literal.end_m - without.end_m[: literal.t_s.size]), PRINTED),
+                    Curve(
+                        "as printed", literal.t_s, 1e3 * (literal.end_m - without.end_m[: literal.t_s.size]), PRINTED
+                    ),
                     Curve("corrected", run.t_s[shown], 1e3 * (run.end_m - without.end_m)[shown], CORRECTED),
                 ],
             )

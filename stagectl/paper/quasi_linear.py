@@ -44,15 +44,11 @@ def marker(x_b: float, left_m: float, right_m: float) -> tuple[float, float, flo
 def quasi_linear(x_b: float, left_m: float, right_m: float, left_n_per_m: float, right_n_per_m: float) -> float:
     """F_b of (8) and (9): h_b^T theta_b with theta_b = [K_l, K_l b_l, K_r, K_r b_r], N."""
     h = marker(x_b, left_m, right_m)
-    return (
-        h[0] * left_n_per_m + h[1] * left_n_per_m * left_m + h[2] * right_n_per_m + h[3] * right_n_per_m * right_m
-    )
+    return h[0] * left_n_per_m + h[1] * left_n_per_m * left_m + h[2] * right_n_per_m + h[3] * right_n_per_m * right_m
 
 
 @compiled
-def printed_condition(
-    x_b: float, left_m: float, right_m: float, left_n_per_m: float, right_n_per_m: float
-) -> float:
+def printed_condition(x_b: float, left_m: float, right_m: float, left_n_per_m: float, right_n_per_m: float) -> float:
     """F_b of (8) with the left condition x_b - b_l as (7) shows it, N."""
     left = state_factor(x_b - left_m)
     right = state_factor(right_m - x_b)

@@ -53,7 +53,8 @@ def chapter() -> Chapter:
                 0.0,
                 float(middle[2]),
                 float(middle[1]),
-                "condition of the left side: x_b - b_l makes the gap's left part a contact; only x_b + b_l agrees with (5)",
+                "condition of the left side: x_b - b_l makes the gap's left part a contact; only x_b + b_l "
+                "agrees with (5)",
             ),
         ],
         [

@@ -42,9 +42,10 @@ class Identified:
     def errors_percent(self, true: Backlash) -> dict[str, float]:
         """Return the last estimates' errors, with their sign."""
         return errors_percent(
-            Backlash(*(float(x[-1]) for x in (self.left_m, self.right_m)), *(
-                float(x[-1]) for x in (self.left_stiffness_n_per_m, self.right_stiffness_n_per_m)
-            )),
+            Backlash(
+                *(float(x[-1]) for x in (self.left_m, self.right_m)),
+                *(float(x[-1]) for x in (self.left_stiffness_n_per_m, self.right_stiffness_n_per_m)),
+            ),
             true,
         )
 

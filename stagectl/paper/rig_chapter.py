@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stagectl.paper import gated, identification_test, recursive_least_squares
-from stagectl.paper.figures import CORRECTED, FOURTH, PRINTED, REFERENCE, Curve, Panel, drawn
+from stagectl.paper.figures import CORRECTED, FOURTH, REFERENCE, Curve, Panel, drawn
 from stagectl.paper.gated import Gated
 from stagectl.paper.identification_test import Samples
 from stagectl.paper.observer_chapter import axes_of
@@ -74,7 +74,8 @@ def chapter() -> Chapter:
         rows,
         [_figure(samples, found[NOISES_M[-1]][-1])],
         [
-            "No recording is published. Ours are simulated with the printed joint (25.4 and 176 um, 13.2 and 9.87 N/mm), "
+            "No recording is published. Ours are simulated with the printed joint (25.4 and 176 um, 13.2 and "
+            "9.87 N/mm), "
             "five seeds of noise; so an error is against a known truth.",
             f"The test: {_AMPLITUDE_N:g} N at {_FREQUENCY_HZ:g} Hz, F_1 = (5000 N/m, 600 N s/m), F_2 = (8780 N/m, 50 N "
             f"s/m), 100 N s/m in contact: assumed. Masses and F_2 are known exactly.",
@@ -125,7 +126,14 @@ def _figure(samples: Samples, own: Gated) -> Figure:
     panel = Panel(
         "F_b (N)",
         [
-            Curve("true force, damper included", 1e6 * samples.x_b_m[late], samples.contact_force_n[late], FOURTH, "-", 0.7),
+            Curve(
+                "true force, damper included",
+                1e6 * samples.x_b_m[late],
+                samples.contact_force_n[late],
+                FOURTH,
+                "-",
+                0.7,
+            ),
             curve("the paper's fit", RIG_6_1, REFERENCE, "-"),
             curve("gated estimator", own.last, CORRECTED, "--"),
         ],

@@ -22,6 +22,12 @@ class Row:
     remark: str = ""
 
 
+def pair(equation: str, quantity: str, unit: str, paper: Value, both: Sequence[Value], remark: str = "") -> Row:
+    """Make a row of (as printed, corrected)."""
+    printed, corrected = both
+    return Row(equation, quantity, unit, paper, printed, corrected, remark)
+
+
 @dataclass(frozen=True, slots=True)
 class Chapter:
     """One section of the paper, worked through."""
