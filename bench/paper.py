@@ -5,6 +5,7 @@ the time that `stagectl reproduce` takes from nothing.
 """
 
 import os
+import re
 import statistics
 import subprocess
 import sys
@@ -62,7 +63,8 @@ def figures_of(chapter: Chapter) -> Iterator[Figure]:
         said = f"the paper: {row.paper * scale:g} {unit}" if isinstance(row.paper, float) else ""
         for which, value in (("as printed", row.printed), ("corrected", row.corrected)):
             if isinstance(value, float):
-                bar = Bar(f"{chapter.section} {row.equation} {row.quantity}: {which}", unit)
+                quantity = re.sub(r"\|(\w+)\|", r"abs(\1)", row.quantity)  # a bar would end the cell of a table
+                bar = Bar(f"{chapter.section} {row.equation} {quantity}: {which}", unit)
                 yield judged(bar, value * scale, reason=said)
 
 

@@ -158,8 +158,8 @@ DaskAddress = Annotated[
 SectionArgument = Annotated[
     str | None,
     typer.Argument(
-        help="model | quasi-linear | observer | identification | decoupling | sliding-mode | control | rig, or a "
-        "section's number such as 5.3 (default: all).",
+        help="model | quasi-linear | observer | identification | decoupling | sliding-mode | control | rig | "
+        "comparison, or a section's number such as 5.3 (default: all).",
         metavar="[SECTION]",
     ),
 ]

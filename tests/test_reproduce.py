@@ -28,8 +28,8 @@ def test_a_section_is_asked_for_by_name_or_by_number():
     assert asked("5.3") == ("control",)
     assert asked("5.2") == ("observer", "identification")
     assert asked("3.2 b") == ("identification",)
-    with pytest.raises(RequestError, match=r"'6\.2' is no section .* control \(5\.3\)"):
-        asked("6.2")
+    with pytest.raises(RequestError, match=r"'6\.3' is no section .* control \(5\.3\)"):
+        asked("6.3")
 
 
 def test_one_section_as_json_and_as_a_page(capsys, tmp_path):

@@ -71,11 +71,20 @@ def sine_5_3(dt_s: float) -> Reference:
 
 def trapezoid_5_3(dt_s: float) -> Reference:
     """x_ref2, our reading: 1 s rest, 0.8 m at 0.2 m/s, 4 s rest, and back; corners rounded to 0.33 m/s^2."""
-    t_s = np.arange(round(_TRAPEZOID_S / dt_s)) * dt_s
-    speed = np.where((t_s >= 1.0) & (t_s < 5.0), 1.0, 0.0) - np.where((t_s >= 9.0) & (t_s < 13.0), 1.0, 0.0)
-    velocity = _TRAPEZOID_SPEED_M_PER_S * speed
-    for window_s in _TRAPEZOID_CORNERS_S:
+    return trapezoid("trapezoid", _TRAPEZOID_SPEED_M_PER_S, 4.0, _TRAPEZOID_CORNERS_S, _TRAPEZOID_S, dt_s)
+
+
+def trapezoid(
+    name: str, speed_m_per_s: float, phase_s: float, corners_s: tuple[float, ...], duration_s: float, dt_s: float
+) -> Reference:
+    """1 s rest, a ramp of `phase_s`, rest for as long, and back; corners rounded by moving averages."""
+    t_s = np.arange(round(duration_s / dt_s)) * dt_s
+    ends = 1.0 + phase_s * np.arange(4)
+    ahead = (t_s >= ends[0]) & (t_s < ends[1])
+    back = (t_s >= ends[2]) & (t_s < ends[3])
+    velocity = speed_m_per_s * (ahead.astype(float) - back.astype(float))
+    for window_s in corners_s:
         count = round(window_s / dt_s)
         velocity = np.cumsum(velocity - np.concatenate([np.zeros(count), velocity[:-count]])) / count
     position = np.concatenate([[0.0], np.cumsum(0.5 * dt_s * (velocity[1:] + velocity[:-1]))])
-    return Reference("trapezoid", dt_s, position, velocity, np.gradient(velocity, dt_s))
+    return Reference(name, dt_s, position, velocity, np.gradient(velocity, dt_s))
