@@ -179,6 +179,8 @@ def _is_numeric(cells: Sequence[str | Quantity]) -> bool:
 def _cell(table: Table, cell: str | Quantity, mark: str) -> str:
     if not isinstance(cell, str | Quantity):
         raise RequestError(f"table '{table.title}': {cell!r} has no unit; give a Quantity or text")
+    if mark and isinstance(cell, str):
+        mark = ' class="n words"'  # which may wrap; a number never does
     return f"<td{mark}>{html.escape(str(cell))}</td>"
 
 
@@ -265,6 +267,7 @@ table{border-collapse:collapse;width:100%;font-size:.92rem;font-variant-numeric:
 th,td{text-align:left;padding:.35rem .9rem .35rem 0;border-bottom:1px solid var(--grid);vertical-align:top}
 th{color:var(--muted);font-weight:600;border-bottom:1.5px solid var(--muted)}
 th.n,td.n{text-align:right;white-space:nowrap}
+td.words{white-space:normal}
 th:last-child,td:last-child{padding-right:0}
 .link{margin:1rem 0 0}a{color:var(--series-2)}
 ul{margin:0;padding-left:1.2rem}

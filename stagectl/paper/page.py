@@ -23,7 +23,7 @@ def page(chapters: Sequence[Chapter], missing: Sequence[str]) -> Report:
         parts += chapter.figures
     if missing:
         parts.append(Section("Not here yet", missing))
-    paper = "S. Kang et al., Machines 11(12):1044, 2023, doi 10.3390/machines11121044"
+    paper = "Kang et al., Machines 11(12):1044, 2023, doi 10.3390/machines11121044"
     return Report(TITLE, _BANNER, parts=parts, facts=[("Paper", paper)])
 
 

@@ -115,7 +115,7 @@ def _bound_rows() -> list[Row]:
     corrected = float(sliding_mode.corrected()["eta_per_s"][0])
     kept = SlidingModeValues(corrected, *(getattr(CONTROL_5_3, name) for name in _OTHERS))
     other = sliding_mode.error_bound_m(kept)
-    none = "none: the root is imaginary"
+    none = "none: its root is imaginary"
     return [
         Row("(45)", "bound on |e|", "m", 22e-6, bound, none if other is None else other,
             "corrected eta: (45) has no root, and the error none of this kind"),
