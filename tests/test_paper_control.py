@@ -43,6 +43,23 @@ def test_the_printed_decoupler_is_26():
     assert compensation.printed_decoupler(q).at(3.0) == pytest.approx(-kw / km * over / below, rel=1e-9)
 
 
+def test_the_corrected_decoupler_is_both_windings():
+    q = plant_as_printed.parameters(cases.backlash())[0]
+    s = 2j * np.pi * 100.0
+    ratio = float(q["micro_force_constant_n_per_a"] / q["macro_force_constant_n_per_a"])
+    wanted = ratio * (9.37e-3 * s + 2.75) / (2.52e-3 * s + 0.76)
+    assert compensation.corrected_decoupler(q).at(100.0) == pytest.approx(wanted, rel=1e-9)
+
+
+def test_static_decoupling_knows_the_spring_as_well():
+    """The end begins 3 mm off: 1.5 N of K2 on the macro, 8 um of its servo, unless it is made up for."""
+    setting = Setting(
+        drive=plant_as_printed.DRIVE_CURRENT, decoupling=closed_loop.DECOUPLING_STATIC, start_offset_m=3e-3
+    )
+    run = cases.sliding("trapezoid", sliding_mode.corrected(), setting)
+    assert np.max(np.abs(run.macro_error_m)) < 2e-6
+
+
 def test_24_is_the_end_beside_a_macro_that_stands():
     """The denominator is that of voltage to relative position of the platform itself, macro held by its mass."""
     q = plant_as_printed.parameters(cases.backlash())

@@ -114,7 +114,7 @@ def _macro_figure(runs: dict[tuple[str, str], Run]) -> Figure:
     return Figure(
         "Decoupling of the macro, (26)",
         drawn(panels, "time (s)"),
-        "As printed, with K_c = K_mw, the macro is millimetres off on the sine and lost on the trapezoid: left out here.",
+        "As printed, with K_c = K_mw, the macro is millimetres off on the sine and lost on the trapezoid: not drawn.",
         "Macro's error over time without decoupling, with the dynamic and with the static one.",
     )
 
