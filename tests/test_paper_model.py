@@ -158,7 +158,7 @@ def test_the_predicted_limit_cycle_is_met_from_both_sides():
     predicted = limit_cycle.predicted(servo, 0.02, 1e3, 70.0, 40.0)
     assert predicted is not None
     for start_m in (0.03, 0.3):
-        met = limit_cycle.met(servo, q.copy(), start_m, 300.0)
+        met = limit_cycle.met(limit_cycle.swing(servo, q.copy(), start_m, 300.0))
         assert met.amplitude_m == pytest.approx(predicted.amplitude_m, rel=0.03)
         assert met.frequency_hz == pytest.approx(predicted.frequency_hz, rel=0.03)
 

@@ -18,6 +18,9 @@ from scipy.optimize import root_scalar
 from stagectl.compiled import compiled
 from stagectl.paper import plant_as_printed
 
+DT_S = 2e-4
+"""Period of the servo and of the samples."""
+
 
 @dataclass(frozen=True, slots=True)
 class Servo:
@@ -84,12 +87,17 @@ def _run(state: np.ndarray, plant: np.ndarray, w2: float, wi3: float, c: float, 
         plant_as_printed.advance(s, q, force / q.macro_force_constant_n_per_a, 0.0, dt_s, 1)
 
 
-def met(servo: Servo, plant: np.ndarray, start_m: float, duration_s: float, dt_s: float = 2e-4) -> Cycle:
-    """Run the servo on the platform from an end that is `start_m` off, and measure x_b over the last quarter."""
+def swing(servo: Servo, plant: np.ndarray, start_m: float, duration_s: float, dt_s: float = DT_S) -> np.ndarray:
+    """Return x_b on the platform under the servo, from an end that is `start_m` off, sampled every `dt_s`, m."""
     out = np.empty(round(duration_s / dt_s))
     state = plant_as_printed.init(start_m)
     _run(state, plant, servo.stiffness_per_s2, servo.integral_per_s3, servo.damping_per_s, dt_s, out)
-    late = out[3 * out.size // 4 :]
+    return out
+
+
+def met(x_b_m: np.ndarray, dt_s: float = DT_S) -> Cycle:
+    """Measure the oscillation in the last quarter of a swing."""
+    late = x_b_m[3 * x_b_m.size // 4 :]
     middle = 0.5 * (late.max() + late.min())
     rising = np.flatnonzero((late[:-1] < middle) & (late[1:] >= middle))
     frequency = (rising.size - 1) / ((rising[-1] - rising[0]) * dt_s) if rising.size > 1 else 0.0

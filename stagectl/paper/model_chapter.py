@@ -15,6 +15,8 @@ _MICRO_BANDWIDTH_HZ = 2.0
 _LOST_M = 10.0  # a joint that has come apart this far
 _REST_S = 15.0  # x_h2 stands by then
 _STIFFNESS_N_PER_M = TABLE_2.left_stiffness_n_per_m
+_CYCLE_S = 400.0
+_CYCLE_STARTS_M = (0.03, 0.2)
 _CYCLE_GAIN_HZ = 0.5  # of the servo that drags the micro by its end
 
 
@@ -30,7 +32,8 @@ def chapter() -> Chapter:
     expected = limit_cycle.predicted(
         servo, 0.5 * GAP_5_1_M, _STIFFNESS_N_PER_M, TABLE_1.macro_mass_kg, TABLE_1.micro_mass_kg
     )
-    found = limit_cycle.met(servo, plant, 0.03, 400.0)
+    swings = [limit_cycle.swing(servo, plant, start_m, _CYCLE_S) for start_m in _CYCLE_STARTS_M]
+    found = limit_cycle.met(swings[0])
     rows = [
         _current_row(corrected[0]),
         _carrying_row(sine),
@@ -69,7 +72,11 @@ def chapter() -> Chapter:
         "2, 5.1",
         "Platform with coupling and backlash, (1)-(5)",
         rows,
-        [_displacement_figure(corrected, printed, free), _divergence_figure(right, wrong)],
+        [
+            _displacement_figure(corrected, printed, free),
+            _cycle_figure(swings, expected),
+            _divergence_figure(right, wrong),
+        ],
         [
             "The inertia term of (2) is m2 times the relative acceleration; Newton needs the absolute one. Taken: "
             "m2 d''.",
@@ -236,6 +243,22 @@ def _displacement_figure(
         drawn(panels, "time (s)"),
         "Below each: the end minus what the same servos do without coupling and backlash: the distortion.",
         "End over time for both references, and the distortion by the joint below each.",
+    )
+
+
+def _cycle_figure(swings: list[np.ndarray], expected: limit_cycle.Cycle | None) -> Figure:
+    shown = slice(0, round(60.0 / limit_cycle.DT_S))
+    t_s = np.arange(swings[0].size)[shown] * limit_cycle.DT_S
+    curves = [
+        Curve(f"from {1e3 * start_m:g} mm off", t_s, 1e3 * x_b_m[shown], colour)
+        for start_m, x_b_m, colour in zip(_CYCLE_STARTS_M, swings, (CORRECTED, THIRD), strict=True)
+    ]
+    amplitude = () if expected is None else (-1e3 * expected.amplitude_m, 1e3 * expected.amplitude_m)
+    return Figure(
+        "The limit cycle of a servo that holds the end through the gap",
+        drawn([Panel("macro minus end (mm)", curves, lines=amplitude)], "time (s)"),
+        "Dashed: the amplitude that harmonic balance predicts. Both starts end there.",
+        "Relative position over time from two starts: both end in the same oscillation.",
     )
 
 
