@@ -14,18 +14,18 @@ from stagectl.paper.printed_values import Backlash
 from stagectl.profile import load_profile
 
 _PROFILE = "kang-2023"
+_SDS = ("left_sd_m", "right_sd_m", "left_stiffness_sd_n_per_m", "right_stiffness_sd_n_per_m")  # in Backlash's order
 
 
 @dataclass(frozen=True, slots=True)
 class Gated:
-    """Estimates over time, shapes (n,), nan before the first; standard deviations of the last."""
+    """Estimates over time, shapes (n,), nan before the first; `sd` are the standard deviations of the last."""
 
     left_m: np.ndarray
     right_m: np.ndarray
     left_stiffness_n_per_m: np.ndarray
     right_stiffness_n_per_m: np.ndarray
-    left_sd_m: float
-    right_sd_m: float
+    sd: Backlash
 
     @property
     def last(self) -> Backlash:
@@ -68,4 +68,5 @@ def along(
     b = backlash.init(profile, forgetting_ratio=forgetting_ratio)
     out = np.empty((end_position_m.size, 4))
     _along(b, belief, macro_position_m, end_position_m, spring_n_per_m, damping_n_s_per_m, out)
-    return Gated(out[:, 0], out[:, 1], out[:, 2], out[:, 3], float(b["left_sd_m"][0]), float(b["right_sd_m"][0]))
+    sd = Backlash(*(float(b[name][0]) for name in _SDS))
+    return Gated(out[:, 0], out[:, 1], out[:, 2], out[:, 3], sd)

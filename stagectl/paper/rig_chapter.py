@@ -84,7 +84,7 @@ def chapter() -> Chapter:
     )
 
 
-def recording() -> tuple[np.ndarray, Samples]:
+def recording(duration_s: float = _DURATION_S) -> tuple[np.ndarray, Samples]:
     """Return the platform and its motion; every recording adds noise of its own."""
     platform = identification_test.platform(
         RIG_6_1,
@@ -94,7 +94,7 @@ def recording() -> tuple[np.ndarray, Samples]:
         frequency_hz=_FREQUENCY_HZ,
         contact_damping_n_s_per_m=_CONTACT_DAMPING_N_S_PER_M,
     )
-    return platform, identification_test.run(platform, _DURATION_S)
+    return platform, identification_test.run(platform, duration_s)
 
 
 def identified(samples: Samples, noise_m: float, seed: int) -> Gated:
