@@ -40,6 +40,7 @@ check: setup
 bench: setup
 	$(BIN)/python -m bench main_job --markdown docs/figures.md
 	$(BIN)/python -m bench gap --markdown docs/figures-gap.md
+	$(BIN)/python -m bench paper --markdown docs/figures-paper.md
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis

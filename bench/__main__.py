@@ -14,7 +14,7 @@ from pathlib import Path
 
 from bench.figure import Figure
 
-NAMES = ("gap", "main_job")
+NAMES = ("gap", "main_job", "paper")
 
 
 def _arguments(argv: list[str] | None) -> argparse.Namespace:

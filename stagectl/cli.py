@@ -155,7 +155,17 @@ DaskAddress = Annotated[
     _option("Scheduler of a dask.distributed cluster that does the work instead.", "--dask", metavar="ADDRESS"),
 ]
 
-_PROFILE, _RUNS, _GAP = "oled-printer", Path("runs"), Path("gap")
+SectionArgument = Annotated[
+    str | None,
+    typer.Argument(
+        help="model | quasi-linear | observer | identification | decoupling | sliding-mode | control | rig | "
+        "comparison, or a section's number such as 5.3 (default: all).",
+        metavar="[SECTION]",
+    ),
+]
+PaperFolder = Annotated[Path, _option("Folder of the page.", "--out", metavar="FOLDER")]
+
+_PROFILE, _RUNS, _GAP, _PAPER = "oled-printer", Path("runs"), Path("gap"), Path("paper")
 
 
 def _version(wanted: bool) -> None:
@@ -270,6 +280,12 @@ def home(
 def replay(run: RunArgument, runs: Runs = _RUNS, json: Json = False) -> None:
     """Send a run's raw bytes through the same code again and compare every value, bit for bit."""
     _deliver("replay", json, lambda voice: commands.runs.replay(voice, run, runs))
+
+
+@app.command(epilog=_epilog("stagectl reproduce", "stagectl reproduce 5.3", "stagectl reproduce observer --json"))
+def reproduce(section: SectionArgument = None, out: PaperFolder = _PAPER, json: Json = False) -> None:
+    """Run the paper that the control law comes from, as printed and as corrected, beside its own numbers."""
+    _deliver("reproduce", json, lambda voice: commands.reproduce.show(voice, section, out))
 
 
 @profile_app.command("check", epilog=_epilog("stagectl profile check my-stage.toml"))

@@ -93,6 +93,7 @@ class Report:
     """A page: title, banner (what to know before reading any number), facts, links, tables, figures, sections.
 
     links: (file beside the page, what it is). The page is whole without them.
+    parts: what comes before the tables, in the order given, for a page that goes from chapter to chapter.
     """
 
     title: str
@@ -102,6 +103,7 @@ class Report:
     facts: Sequence[tuple[str, str]] = field(default=())
     sections: Sequence[Section] = ()
     links: Sequence[tuple[str, str]] = ()
+    parts: Sequence[Table | Figure | Section] = ()
 
     def html(self) -> str:
         """Render the page."""
@@ -115,9 +117,15 @@ class Report:
             f'<p class="link"><a href="{html.escape(quote(file))}">{html.escape(said)}</a></p>'
             for file, said in self.links
         ]
-        parts += [_table_html(table) for table in self.tables]
-        parts += [_figure_html(figure, number) for number, figure in enumerate(self.figures, 1)]
-        parts += [_section_html(section) for section in self.sections]
+        figures_count = 0
+        for part in (*self.parts, *self.tables, *self.figures, *self.sections):
+            if isinstance(part, Table):
+                parts.append(_table_html(part))
+            elif isinstance(part, Section):
+                parts.append(_section_html(part))
+            else:
+                figures_count += 1
+                parts.append(_figure_html(part, figures_count))
         return _PAGE.format(title=html.escape(self.title), style=_page_style(), body="\n".join(parts))
 
     def write(self, path: str | Path) -> None:
@@ -149,10 +157,7 @@ def _table_html(table: Table) -> str:
     for row in table.rows:
         if len(row) != len(table.columns):
             raise RequestError(f"table '{table.title}': {len(row)} cells under {len(table.columns)} headings")
-    numeric = [
-        bool(table.rows) and all(isinstance(row[i], Quantity) or row[i] == "" for row in table.rows)
-        for i in range(len(table.columns))
-    ]
+    numeric = [_is_numeric([row[i] for row in table.rows if row[i] != ""]) for i in range(len(table.columns))]
     marks = [' class="n"' if right else "" for right in numeric]
     head = "".join(f"<th{mark}>{html.escape(name)}</th>" for name, mark in zip(table.columns, marks, strict=True))
     body = "\n".join(
@@ -166,9 +171,16 @@ def _table_html(table: Table) -> str:
     )
 
 
+def _is_numeric(cells: Sequence[str | Quantity]) -> bool:
+    """Tell a column of quantities, in which a word may stand here and there ("diverges")."""
+    return 2 * sum(isinstance(cell, Quantity) for cell in cells) > len(cells)
+
+
 def _cell(table: Table, cell: str | Quantity, mark: str) -> str:
     if not isinstance(cell, str | Quantity):
         raise RequestError(f"table '{table.title}': {cell!r} has no unit; give a Quantity or text")
+    if mark and isinstance(cell, str):
+        mark = ' class="n words"'  # which may wrap; a number never does
     return f"<td{mark}>{html.escape(str(cell))}</td>"
 
 
@@ -255,6 +267,7 @@ table{border-collapse:collapse;width:100%;font-size:.92rem;font-variant-numeric:
 th,td{text-align:left;padding:.35rem .9rem .35rem 0;border-bottom:1px solid var(--grid);vertical-align:top}
 th{color:var(--muted);font-weight:600;border-bottom:1.5px solid var(--muted)}
 th.n,td.n{text-align:right;white-space:nowrap}
+td.words{white-space:normal}
 th:last-child,td:last-child{padding-right:0}
 .link{margin:1rem 0 0}a{color:var(--series-2)}
 ul{margin:0;padding-left:1.2rem}

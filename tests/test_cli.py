@@ -44,6 +44,7 @@ COMMANDS = [
     ["jog"],
     ["home"],
     ["replay"],
+    ["reproduce"],
     ["profile"],
     ["profile", "check"],
     ["profile", "show"],

@@ -11,7 +11,7 @@ import pytest
 from stagectl import drawing, figures, report
 from stagectl.errors import RecordError, RequestError
 from stagectl.figures import BacklashCurve, ErrorTrace, Estimate, HoldTrace, TimeSeries
-from stagectl.report import Figure, Quantity, Report, Table
+from stagectl.report import Figure, Quantity, Report, Section, Table
 
 _RNG = np.random.default_rng(5)
 _T_S = np.arange(6000) * 1e-3
@@ -186,6 +186,23 @@ def test_page_stands_alone():
         assert target.strip("'\"").lstrip("#") in page.ids
     assert "@import" not in text
     assert "<script" not in text
+
+
+def test_words_in_a_column_of_numbers_wrap_and_numbers_dont():
+    rows = [["a", Quantity(1.0, "m")], ["b", Quantity(2.0, "m")], ["c", "diverges at last"]]
+    page = Report("t", "", tables=[Table("T", ["what", "value"], rows)]).html()
+    assert '<td class="n">1.00 m</td>' in page
+    assert '<td class="n words">diverges at last</td>' in page
+    assert '<th class="n">value</th>' in page
+    assert "<td>a</td>" in page
+
+
+def test_parts_stand_in_the_order_given_and_share_the_figures_numbers():
+    figure = Figure("Drawn", _tracking())
+    page = Report(
+        "t", "", figures=[figure], parts=[Section("First", ["x"]), figure, Table("Last", ["a"], [["b"]])]
+    ).html()
+    assert page.index("First") < page.index("Figure 1. Drawn") < page.index("Last") < page.index("Figure 2. Drawn")
 
 
 def test_page_escapes_every_text():

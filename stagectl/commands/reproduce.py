@@ -1,0 +1,63 @@
+"""`stagectl reproduce`: the paper run as printed and as corrected, beside its own numbers."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from rich import box
+from rich.table import Table
+
+from stagectl.commands.answer import Answer, Voice
+from stagectl.errors import RequestError
+from stagectl.paper.chapters import MISSING, asked, work_through
+from stagectl.paper.page import cells, page
+from stagectl.paper.rows import Chapter
+
+PAGE = "paper.html"
+
+
+def show(voice: Voice, section: str | None, out: Path) -> Answer:
+    """Work sections through, write the page, and lay the numbers side by side."""
+    names = asked(section)
+    _make_folder(out)
+    chapters = work_through(names, voice.progress)
+    voice.progress("drawing the page", 0.0)
+    missing = MISSING if section is None else ()
+    page(chapters, missing).write(out / PAGE)
+    voice.progress.done()
+    data = {
+        "sections": [
+            {
+                "name": chapter.name,
+                "section": chapter.section,
+                "title": chapter.title,
+                "rows": [asdict(row) for row in chapter.rows],
+                "readings": list(chapter.readings),
+            }
+            for chapter in chapters
+        ],
+        "missing": list(missing),
+        "page": str(out / PAGE),
+    }
+    shown = [
+        part for chapter in chapters for part in (f"\n[bold]{chapter.section}. {chapter.title}[/]", _table(chapter))
+    ]
+    return Answer(data, [*shown, *(f"not yet: {what}" for what in missing), f"page: {out / PAGE}"])
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"--out {out}: can't be made: {error.strerror}; give another folder") from error
+
+
+def _table(chapter: Chapter) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="bold cyan")
+    table.add_column("paper", no_wrap=True)
+    table.add_column("what", min_width=24)
+    for name in ("paper's", "as printed", "corrected"):
+        table.add_column(name, justify="right", min_width=9)
+    table.add_column("remark", style="dim", ratio=1)
+    for row in chapter.rows:
+        table.add_row(*(str(cell) for cell in cells(row)))
+    return table

@@ -1,0 +1,72 @@
+"""The project's own estimator (`stagectl.backlash`) on the samples of the paper's identification test.
+
+It sees both positions and what pushes the micro besides the joint: -F_2 of (10), a spring and a damper to the base,
+taken from the measured positions. No observer, no first values, no marking by an estimate.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stagectl import backlash, estimator
+from stagectl.compiled import compiled
+from stagectl.paper.printed_values import Backlash
+from stagectl.profile import load_profile
+
+_PROFILE = "kang-2023"
+_SDS = ("left_sd_m", "right_sd_m", "left_stiffness_sd_n_per_m", "right_stiffness_sd_n_per_m")  # in Backlash's order
+
+
+@dataclass(frozen=True, slots=True)
+class Gated:
+    """Estimates over time, shapes (n,), nan before the first; `sd` are the standard deviations of the last."""
+
+    left_m: np.ndarray
+    right_m: np.ndarray
+    left_stiffness_n_per_m: np.ndarray
+    right_stiffness_n_per_m: np.ndarray
+    sd: Backlash
+
+    @property
+    def last(self) -> Backlash:
+        """The last estimates."""
+        return Backlash(
+            float(self.left_m[-1]),
+            float(self.right_m[-1]),
+            float(self.left_stiffness_n_per_m[-1]),
+            float(self.right_stiffness_n_per_m[-1]),
+        )
+
+
+@compiled
+def _along(
+    b: np.ndarray, q: np.ndarray, macro_m: np.ndarray, end_m: np.ndarray, spring: float, damping: float, out: np.ndarray
+) -> None:
+    record = b[0]
+    belief = q[0]
+    before = end_m[0]
+    for k in range(end_m.size):
+        rate = (end_m[k] - before) / record.period_s
+        force_n = -0.5 * spring * (end_m[k] + before) - damping * rate
+        backlash.step(record, k, macro_m[k], end_m[k], force_n, belief)
+        before = end_m[k]
+        out[k, 0], out[k, 1] = record.left_m, record.right_m
+        out[k, 2], out[k, 3] = record.left_stiffness_n_per_m, record.right_stiffness_n_per_m
+
+
+def along(
+    macro_position_m: np.ndarray,
+    end_position_m: np.ndarray,
+    spring_n_per_m: float,
+    damping_n_s_per_m: float,
+    forgetting_ratio: float = 1.0,
+) -> Gated:
+    """Run the estimator over samples of a millisecond; spring and damping are those of F_2."""
+    profile = load_profile(_PROFILE)
+    belief = estimator.belief(profile)
+    belief["spring_n_per_m"] = belief["damping_n_s_per_m"] = 0.0  # (10) has none between the stages
+    b = backlash.init(profile, forgetting_ratio=forgetting_ratio)
+    out = np.empty((end_position_m.size, 4))
+    _along(b, belief, macro_position_m, end_position_m, spring_n_per_m, damping_n_s_per_m, out)
+    sd = Backlash(*(float(b[name][0]) for name in _SDS))
+    return Gated(out[:, 0], out[:, 1], out[:, 2], out[:, 3], sd)

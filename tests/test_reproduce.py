@@ -1,0 +1,98 @@
+"""`stagectl reproduce`: sections by name and by number, the page, the numbers as JSON, the bench's figures of it."""
+
+import html
+import json
+import re
+
+import pytest
+
+from bench import paper as bench_paper
+from stagectl import cli
+from stagectl.errors import RequestError
+from stagectl.paper.chapters import CHAPTERS, asked, work_through
+from stagectl.paper.page import COLUMNS, page
+from stagectl.paper.rows import Chapter, Row
+from stagectl.report import Quantity
+
+
+def call(capsys, *arguments) -> tuple[int, str, str]:
+    capsys.readouterr()
+    code = cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_a_section_is_asked_for_by_name_or_by_number():
+    assert asked(None) == tuple(CHAPTERS)
+    assert asked("observer") == ("observer",)
+    assert asked("5.3") == ("control",)
+    assert asked("5.2") == ("observer", "identification")
+    assert asked("3.2 b") == ("identification",)
+    with pytest.raises(RequestError, match=r"'6\.3' is no section .* control \(5\.3\)"):
+        asked("6.3")
+
+
+def test_one_section_as_json_and_as_a_page(capsys, tmp_path):
+    code, out, err = call(capsys, "reproduce", "3.1", "--out", tmp_path, "--json")
+    assert code == 0
+    assert "quasi-linear" in err
+    answer = json.loads(out)
+    (section,) = answer["sections"]
+    assert section["name"] == "quasi-linear"
+    force = next(row for row in section["rows"] if row["unit"] == "N")
+    assert (force["printed"], force["corrected"]) == (pytest.approx(50.0), 0.0)
+    assert answer["missing"] == []
+    text = (tmp_path / "paper.html").read_text()
+    assert text.count("<svg") == 1
+    assert "50.0 N" in text
+
+
+def test_the_terminal_shows_the_same_rows(capsys, tmp_path):
+    code, out, _ = call(capsys, "reproduce", "quasi-linear", "--out", tmp_path)
+    assert code == 0
+    assert "3.1. Quasi-linear backlash model" in out
+    assert re.search(r"50\.0 N\s+0 N", out)
+
+
+def test_a_section_that_is_not_there_is_wrong_usage(capsys, tmp_path):
+    code, _, err = call(capsys, "reproduce", "9.9", "--out", tmp_path / "new")
+    assert code == 2
+    assert "choose from model (2, 5.1)" in err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_is_a_file_is_refused(capsys, tmp_path):
+    (tmp_path / "page").write_text("")
+    code, _, err = call(capsys, "reproduce", "3.1", "--out", tmp_path / "page")
+    assert code == 2
+    assert "give another folder" in err
+
+
+def test_words_and_missing_numbers_stand_in_their_columns():
+    chapter = Chapter("x", "9", "Nine", [Row("(1)", "a", "m", None, "diverges", 2e-6)], readings=["taken so"])
+    text = page([chapter], ["(2)"]).html()
+    assert text.index("Nine") < text.index("taken so") < text.index("Not here yet")
+    assert all(f">{html.escape(name)}</th>" in text for name in COLUMNS)
+    assert "<td" in text
+    assert "diverges" in text
+    assert str(Quantity(2e-6, "m")) == "2.00 µm"
+    assert "2.00 µm" in text
+
+
+def test_progress_counts_chapters():
+    heard = []
+    (chapter,) = work_through(["quasi-linear"], lambda what, share: heard.append((what, share)))
+    assert heard == [("3.1 quasi-linear backlash model", 0.0)]
+    assert chapter.name == "quasi-linear"
+
+
+def test_every_row_that_has_a_number_is_a_figure():
+    chapter = Chapter(
+        "x", "9", "Nine", [Row("(1)", "a", "m", 1.0, "diverges", 2e-6), Row("(2)", "b", "N", None, 3.0, 4.0)]
+    )
+    found = {figure.figure: (figure.value, figure.unit) for figure in bench_paper.figures_of(chapter)}
+    assert found == {
+        "9 (1) a: corrected": (pytest.approx(2.0), "um"),
+        "9 (2) b: as printed": (3.0, "N"),
+        "9 (2) b: corrected": (4.0, "N"),
+    }
