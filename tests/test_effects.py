@@ -290,7 +290,7 @@ def test_what_a_search_knows_of_a_law_is_declared_with_it(catalogue):
     known = catalogue["late"]
     assert known.traits == {Trait.LATE_READING}
     assert (known.searched, known.shape, known.shown_by) == (("delay_s",), ("delay_s",), "acceleration")
-    assert (known.has_step, known.answers_acceleration, known.period) == (False, False, "")
+    assert (known.has_step, known.period) == (False, "")
 
 
 @pytest.mark.parametrize(
@@ -311,12 +311,10 @@ def test_what_a_search_can_not_know_of_a_law(declared, said):
 
 
 def test_what_laws_say_by_their_arguments():
-    """Steps, resonances and periods are in the text of a law: nobody lists their names."""
+    """Steps and periods are in the text of a law: nobody lists their names."""
     steps = {name for name, known in CATALOGUE.items() if known.has_step}
     assert {"coulomb_friction", "stribeck_friction", "contact_hysteresis"} <= steps
     assert not steps & {"viscous_friction", "dahl_friction", "cogging"}
-    answering = {name for name, known in CATALOGUE.items() if known.answers_acceleration}
-    assert answering == {"mass_error", "flexible_mode"}  # a reading that is late moves nothing
     periods = {name: known.period for name, known in CATALOGUE.items() if known.period}
     assert periods == {
         "cogging": "pitch_m",
