@@ -15,8 +15,8 @@ from stagectl.effects import Effect
 PARTS_COUNT = 4
 """Parts of a sample interval: friction on whole milliseconds left 57 times its noise, on quarters 8 (prototype)."""
 
-_STEP_RATIO = 1.0 / 256.0  # of a period: the grid of step responses
-_RESPONSE_S = 0.2
+_STEP_RATIO = 1.0 / 1024.0  # of a period: the grid of step responses
+_RESPONSE_PERIODS = (16, 256)  # of a step response: the second where it has not faded within the first
 _FADING_LAGS = 12.0
 _FADED = 1e-6  # of the greatest part of a step response: all behind it is left out
 _SAME_RATIO = 1e-9
@@ -105,12 +105,17 @@ def _run(effect: Effect, parameters: list[float], command: np.ndarray, period_s:
 
 def _step_response(effect: Effect, parameters: list[float], period_s: float, height: float) -> np.ndarray:
     """Return what an effect adds to a step of its command, means over steps of a fine grid."""
-    count = round(_RESPONSE_S / (_STEP_RATIO * period_s))
-    command = np.full((count + 1, 1), height)
-    command[0] = 0.0  # an effect may take the first command that it sees for one that was always there
-    out = _run(effect, parameters, command, _STEP_RATIO * period_s)[1:, 0]
-    there = np.flatnonzero(np.abs(out) > _FADED * np.max(np.abs(out)))
-    return out[: there[-1] + 2] if there.size else out[:1]
+    out = np.zeros(1)
+    for periods in _RESPONSE_PERIODS:
+        command = np.full((round(periods / _STEP_RATIO) + 1, 1), height)
+        command[0] = 0.0  # an effect may take the first command that it sees for one that was always there
+        out = _run(effect, parameters, command, _STEP_RATIO * period_s)[1:, 0]
+        there = np.flatnonzero(np.abs(out) > _FADED * np.max(np.abs(out)))
+        if not there.size:
+            return out[:1]
+        if there[-1] + 1 < out.size:
+            return out[: there[-1] + 2]
+    return out
 
 
 def _stepped(

@@ -126,11 +126,13 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
 @compiled
 def filtered(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
     """Return what the filter knows of (position, velocity, slow force) with each sample, what it foretold of (position,
-    velocity) before it, shapes (n, 3) and (n, 2), and minus twice the log-likelihood of the samples."""
+    velocity) before it, shapes (n, 3) and (n, 2), how well it knew the velocity, (n,), and minus twice the
+    log-likelihood of the samples."""
     n = position_m.size
     h = period_s
     a, drive, p = _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)
     known, foretold = np.zeros((n, 3)), np.zeros((n, 2))
+    spread_m_per_s = np.zeros(n)
     unlikely = 0.0
     x = np.zeros(_STATES)
     x[0] = position_m[0]
@@ -145,16 +147,17 @@ def filtered(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, fo
             x = x + gain * z
             p = p - np.outer(gain, p[0])
         known[k] = x[:3]
+        spread_m_per_s[k] = np.sqrt(p[1, 1])
         pull[0] = 0.5 * h * h * early_n[k] / mass_kg
         pull[1] = h * mean_n[k] / mass_kg
         x = a @ x + pull
         p = a @ p @ a.T + drive
         p = 0.5 * (p + p.T)
-    return known, foretold, unlikely
+    return known, foretold, spread_m_per_s, unlikely
 
 
 def moments(fine_n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (mean, early-weighted mean) of forces on equal parts of each interval, shape (n, parts)."""
     parts = fine_n.shape[1]
     middles = (np.arange(parts) + 0.5) / parts
-    return fine_n.mean(axis=1), fine_n @ (2.0 * (1.0 - middles)) / parts
+    return fine_n @ np.full(parts, 1.0 / parts), fine_n @ (2.0 * (1.0 - middles)) / parts

@@ -80,11 +80,13 @@ def motion_under(
     """
     mean_n, early_n = moments(force_n)
     tried = [filtered(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, *doubt) for doubt in _DOUBTS]
-    known, foretold, _ = min(tried, key=lambda one: one[2])
+    known, foretold, spread_m_per_s, _ = min(tried, key=lambda one: one[3])
     step_s = period_s / force_n.shape[1]
     acceleration = (force_n + known[:, 2:]) / mass_kg
     velocity = known[:, 1:2] + step_s * (np.cumsum(acceleration, axis=1) - 0.5 * acceleration)
     position = known[:, :1] + step_s * (np.cumsum(velocity, axis=1) - 0.5 * velocity)
     before = np.concatenate([acceleration[:1, 0], acceleration[:-1, -1]])
     at_samples = np.column_stack([foretold, before])
-    return Motion(position, velocity, acceleration, rough.slow, rough.measured_m_per_s2, at_samples)
+    unsure = np.min(np.abs(velocity), axis=1) < _SLOW_SDS * spread_m_per_s
+    slow = rough.slow | (np.convolve(unsure, np.ones(3), "same") > 0.5)
+    return Motion(position, velocity, acceleration, slow, rough.measured_m_per_s2, at_samples)

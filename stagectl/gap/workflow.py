@@ -27,6 +27,7 @@ _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
 _CURVE_SHARE = 0.03
 _SECOND_PASSES = 2
+_FORETOLD_PASSES = 3  # a friction is known along a motion that knows of the friction
 
 Say = Callable[[str], None]
 
@@ -107,42 +108,42 @@ def _found(
     judge.calibrate()
     say("effects compete")
     before = judge.reducible([])
-    chosen = judge.select(until=lambda group: moves_joint(first, group))
-    last, named = first, _all_named(first, chosen)
-    found = chosen
-    for _ in range(_SECOND_PASSES):
-        if not found:
-            break
-        say("once more, along the motion and at the place where the joint is now known to be")
-        moving = [group for group in found if moves_joint(first, group)]
-        moved = tuple(moved_by(first, found, group) for group in moving)
-        still = [group for group in found if group not in moving]
+
+    def again(known: list[Group]) -> Competition:
+        """Look along the motion that `known` effects make, at the place where they put the joint."""
+        moving = [group for group in known if moves_joint(first, group)]
+        still = [group for group in known if group not in moving]
         explained = first.explained(still)
         first.evidence.forget_trials()
-        there, moved = settled(unsettled, noise, moved, crew)
-        there = crew.here(
-            lambda r, explained=explained: balance.foretold_under(
-                r, balance.sum_of(balance.known_forces(r), explained(r))
-            ),
-            there,
-        )
-        kept = tuple(first.term(group) for group in still)
-        last = Competition(
+        there, moved = settled(unsettled, noise, tuple(moved_by(first, known, group) for group in moving), crew)
+        for _ in range(_FORETOLD_PASSES if still else 1):
+            there = crew.here(
+                lambda r: balance.foretold_under(r, balance.sum_of(balance.known_forces(r), explained(r))), there
+            )
+        made = Competition(
             there,
             len(training),
             seed=seed,
             without=without,
             moved=moved,
-            kept=kept,
+            kept=tuple(first.term(group) for group in still),
             noise=noise_of(there, explained),
             crew=crew,
         )
-        last.judge.threshold = judge.threshold
-        last.judge.trace = judge.trace
+        made.judge.threshold, made.judge.trace = judge.threshold, judge.trace
+        return made
+
+    chosen = found = judge.select(until=lambda group: moves_joint(first, group))
+    last, named = first, _all_named(first, chosen)
+    for _ in range(_SECOND_PASSES):
+        if not found:
+            break
+        say("once more, along the motion and at the place where the joint is now known to be")
+        last = again(found)
         chosen = last.judge.select(last.kept)
-        at_size = remeasured(last, chosen, _all_named(first, found), moved) if moved else ()
+        at_size = remeasured(last, chosen, _all_named(first, found), last.moved) if last.moved else ()
         named = at_size + _all_named(last, chosen)
-        gone = {(one.name, one.acts_on) for one in at_size if not stands(one, there[0])}
+        gone = {(one.name, one.acts_on) for one in at_size if not stands(one, last.evidence.recordings[0])}
         if not gone:
             break
         found = [group for group in found if group.key not in gone]  # at its size it is nothing
@@ -283,6 +284,11 @@ def _excess(search: Competition, chosen: list[Group]) -> float:
     return sum(float(s.gram[0, 0]) - s.count for s in sums) - search.judge.gain(chosen)
 
 
+def _noise(search: Competition) -> float:
+    """Return the standard error of the floor, in squares of the noise."""
+    return float(np.sqrt(2.0 * sum(s.count for s in search.evidence.sums)))
+
+
 def _unknown(search: Competition, chosen: list[Group], before_excess: float) -> dict[str, Any] | None:
     """Return what no effect explains, with the curve that goes furthest, or None where the floor is reached.
 
@@ -290,9 +296,8 @@ def _unknown(search: Competition, chosen: list[Group], before_excess: float) -> 
     is a wrong name.
     """
     judge, evidence = search.judge, search.evidence
-    count = sum(s.count for s in evidence.sums)
     left, first = _excess(search, chosen), before_excess
-    noise = np.sqrt(2.0 * count)
+    noise = _noise(search)
     best, gained = None, 0.0
     for curve in search.curves:
         gain = judge.gain([*chosen, curve]) - judge.gain(chosen)
