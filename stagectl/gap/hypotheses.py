@@ -206,8 +206,8 @@ def effect_terms(recordings: Sequence[Recording], grids: dict[str, list[dict[str
     for effect in CATALOGUE.values():
         if effect.period:
             continue  # searched by what stands out: `periodic_terms`
-        if Trait.KNOWN_PARAMETER in effect.traits:
-            continue  # `parameter_terms` has them
+        if Trait.KNOWN_PARAMETER in effect.traits and effect.places != ("contact_edge",):
+            continue  # `parameter_terms` has them; an edge that is far off has to be taken at its size
         for place in effect.places:
             if place == "micro_force" and Trait.BASE in effect.traits:
                 continue

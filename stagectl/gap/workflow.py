@@ -148,6 +148,8 @@ def _found(
             break
         found = [group for group in found if group.key not in gone]  # at its size it is nothing
         last, chosen, named = first, found, _all_named(first, found)
+    widths = tuple(_width_error(one, last) for one in named if one.name == _WIDTH)
+    named = tuple(one for one in named if one.name != _WIDTH)
     after = last.judge.reducible(chosen)
     unknown = _unknown(last, chosen, before_excess=_excess(first, []))
     verdict = "unknown" if unknown is not None else "found" if named else "nothing"
@@ -156,13 +158,17 @@ def _found(
         named = ()
     solution = solve([*last.judge.base, *chosen], last.evidence.sums)
     refitted = _refitted(last, chosen, solution, believed)
+    for wrong in widths:
+        for name in hypotheses.parts_of(wrong.name):
+            value, sd = refitted[name]
+            refitted[name] = value + wrong.error, float(np.hypot(sd, wrong.sd))
     return Findings(
         profile=believed.name,
         runs=tuple(log.name for log in training),
         holdout=tuple(log.name for log in held),
         verdict=verdict,
         named=named,
-        parameter_errors=_parameter_errors(last, chosen, solution),
+        parameter_errors=_parameter_errors(last, chosen, solution) + widths,
         refitted={name: value for name, (value, _) in refitted.items()},
         not_excited=first.not_excited(),
         not_separable=tuple(one.text for one in not_separable(first.evidence.recordings)),
@@ -292,6 +298,19 @@ def _parameter_errors(search: Competition, chosen: list[Group], solution: Soluti
             aliases = tuple(key[0] for key, _ in search.judge.aliases(chosen, group) if key[1] == "parameter")
             found.append(ParameterError(term.name, float(values[0]), float(sds[0]), own, aliases))
     return tuple(found)
+
+
+_WIDTH = "backlash_width_change"
+
+
+def _width_error(one: Named, search: Competition) -> ParameterError:
+    """Return a gap of another width, found as an effect at its size, as what it is: a known parameter that is wrong."""
+    stated = {term.name: sd for term, sd in search.parameters}
+    change_m = one.parameters["change_m"]
+    aliases = tuple(name for name, place, _ in one.aliases if place == "parameter" and name != "backlash_width_m")
+    return ParameterError(
+        "backlash_width_m", 0.5 * change_m, 0.5 * one.sds["change_m"], stated.get("left_m", 0.0), aliases
+    )
 
 
 def _refitted(
