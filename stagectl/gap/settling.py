@@ -34,7 +34,7 @@ def settled(
     What an edge does is known to first order only: half a micrometre of error left 30 squares of the noise, which an
     edge that moves at its size then explained in machines without any fault. An edge goes no further than is stated.
     """
-    if not moved and not any(r.side is not None and bool(np.any(r.side)) for r in recordings):
+    if not any(r.side is not None and bool(np.any(r.side)) for r in recordings):
         return recordings, moved
     crew = crew or Serial()
     out_m = {"left": 0.0, "right": 0.0}
@@ -84,10 +84,10 @@ def _changed(moved: Moved, ratio: float) -> Moved:
 
 
 def moves_joint(search: Competition, group: Group) -> bool:
-    """Tell whether an effect puts readings or the joint elsewhere: what was learnt there has to be learnt again."""
+    """Tell whether an effect puts the joint elsewhere: what was learnt of contact has to be learnt again."""
     term = search.term(group)
     touches = any(r.side is not None and bool(np.any(r.side)) for r in search.evidence.recordings)
-    return whole_of(term) and (term.acts_on.endswith("_sensor") or (touches and term.acts_on == "contact_edge"))
+    return touches and whole_of(term) and term.acts_on.endswith(("_sensor", "contact_edge"))
 
 
 def moved_by(search: Competition, chosen: list[Group], group: Group) -> Moved:
