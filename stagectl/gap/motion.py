@@ -14,6 +14,10 @@ from stagectl.gap.innovations import filtered, moments
 
 _WINDOW = 21
 _ORDER = 3
+_UNSURE_SDS = 1.4
+"""The same of what the filter knows of it: at 1.0 a Stribeck friction of 5 N drew a second name, at 2.0 a stage that is
+held still said nothing of what pushes it."""
+
 _SLOW_SDS = 6.0
 """Below so many standard deviations the sign of a velocity is not trusted in the ranking stage."""
 
@@ -87,6 +91,6 @@ def motion_under(
     position = known[:, :1] + step_s * (np.cumsum(velocity, axis=1) - 0.5 * velocity)
     before = np.concatenate([acceleration[:1, 0], acceleration[:-1, -1]])
     at_samples = np.column_stack([foretold, before])
-    unsure = np.min(np.abs(velocity), axis=1) < _SLOW_SDS * spread_m_per_s
+    unsure = np.min(np.abs(velocity), axis=1) < _UNSURE_SDS * spread_m_per_s
     slow = rough.slow | (np.convolve(unsure, np.ones(3), "same") > 0.5)
     return Motion(position, velocity, acceleration, slow, rough.measured_m_per_s2, at_samples)
