@@ -29,6 +29,7 @@ _STEPS = (0.3, 1.0, 3.0)
 _MOVED_M = (0.3e-6, 1e-6, 3e-6, 10e-6, 30e-6, 100e-6)
 _TOLERANCE_RATIO = 3e-3
 _WORST = 1e300
+_LARGEST = 1e100
 
 
 class Refiner:
@@ -172,6 +173,8 @@ class Refiner:
             columns = (columns_of or self._evidence.columns_of)(term)
         except (FloatingPointError, ValueError):
             return -_WORST
+        if any(part is not None and not np.max(np.abs(part)) < _LARGEST for parts in columns for part in parts):
+            return -_WORST  # a shape at which a law runs away
         normal, right = self._reduced(columns, term)
         if not term.linear:
             ones = np.ones(right.size)
