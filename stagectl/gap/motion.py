@@ -92,5 +92,6 @@ def motion_under(
     before = np.concatenate([acceleration[:1, 0], acceleration[:-1, -1]])
     at_samples = np.column_stack([foretold, before])
     unsure = np.min(np.abs(velocity), axis=1) < _UNSURE_SDS * spread_m_per_s
+    unsure |= np.min(velocity, axis=1) * np.max(velocity, axis=1) <= 0.0  # where it turns round within the interval
     slow = rough.slow | (np.convolve(unsure, np.ones(3), "same") > 0.5)
     return Motion(position, velocity, acceleration, slow, rough.measured_m_per_s2, at_samples)

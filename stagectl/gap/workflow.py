@@ -148,10 +148,13 @@ def _found(
             break
         found = [group for group in found if group.key not in gone]  # at its size it is nothing
         last, chosen, named = first, found, _all_named(first, found)
+    before_excess = _excess(first, [])
+    if _unknown(last, chosen, before_excess) is not None and _unknown(first, found, before_excess) is None:
+        last, chosen, named = first, found, _all_named(first, found)  # the first look had reached the floor
     widths = tuple(_width_error(one, last) for one in named if one.name == _WIDTH)
     named = tuple(one for one in named if one.name != _WIDTH)
     after = last.judge.reducible(chosen)
-    unknown = _unknown(last, chosen, before_excess=_excess(first, []))
+    unknown = _unknown(last, chosen, before_excess)
     verdict = "unknown" if unknown is not None else "found" if named else "nothing"
     if unknown is not None:
         unknown["beside"] = [[effect.name, effect.acts_on] for effect in named]
