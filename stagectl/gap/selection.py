@@ -18,6 +18,9 @@ NULL_QUANTILE = 0.99
 MATERIAL_RATIO = 0.005
 """Share of everything gained so far that a further hypothesis must gain: below it, laws are not that exact."""
 
+REPEATING_RATIO = 0.002
+"""The same of what repeats over a pitch or a period."""
+
 SEARCH_PRICE = 2.0
 """What a shape that is searched beyond the grid gains on noise, at most about (chi square of one number)."""
 
@@ -222,8 +225,9 @@ class Judge:
         trained, apart = gains[0] - now[0], gains[1] - now[1]
         whole = self.gain([*chosen, group])
         known = CATALOGUE.get(group.key[0])
-        repeats = known is not None and known.period != ""  # at one pitch: no inexact law leaves that
-        least = 0.0 if repeats else MATERIAL_RATIO * (whole - self.gain([]) + self.modelled)
+        repeats = known is not None and known.period != ""  # at one pitch: inexact laws leave little there
+        ratio = REPEATING_RATIO if repeats else MATERIAL_RATIO
+        least = ratio * (whole - self.gain([]) + self.modelled)
         gained = whole - self.gain(chosen)
         return (
             trained > 0.0
