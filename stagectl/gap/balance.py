@@ -14,7 +14,7 @@ from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap import innovations
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.command_path import PARTS_COUNT, changed_by, delayed, driven
-from stagectl.gap.contact import Contact, contact_at, contact_damping_n_s_per_m, side_stiffness_n_per_m
+from stagectl.gap.contact import CONTACT_DAMPING, Contact, contact_at, contact_damping_n_s_per_m, side_stiffness_n_per_m
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
 from stagectl.gap.motion import Motion, motion_of, motion_under
@@ -396,9 +396,16 @@ def _in_order(effect: Effect, values: dict[str, float]) -> list[float]:
     return [values[name] for name in effect.parameters]
 
 
-def with_edges_moved(recording: Recording, left_out_m: float, right_out_m: float) -> Recording:
-    """Return a recording whose joint has its edges further out."""
-    return recording_of(recording.log, _edges_out(recording.believed, left_out_m, right_out_m))
+def with_joint_changed(recording: Recording, left_out_m: float, right_out_m: float, damping_ratio: float) -> Recording:
+    """Return a recording whose joint has its edges further out, and a contact damping that is larger by a ratio."""
+    believed = _edges_out(recording.believed, left_out_m, right_out_m)
+    effects = tuple(
+        {**row, "damping_n_s_per_m": row["damping_n_s_per_m"] * (1.0 + damping_ratio)}
+        if row["name"] == CONTACT_DAMPING
+        else row
+        for row in believed.effects
+    )
+    return recording_of(recording.log, replace(believed, effects=effects))
 
 
 def _edges_out(believed: Believed, left_m: float, right_m: float) -> Believed:
@@ -429,14 +436,31 @@ def effect_forces(
     if place.endswith("_command"):
         return _commanded(recording, axis, effect, parameters)
     value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
+    if place == "contact":
+        value = _contact_changed(recording, value, whole)
     if place in ("contact", "joint"):
-        push_n = value if place == "joint" else recording.side * value if recording.side is not None else 0.0 * value
-        return Forces(macro_n=-push_n, end_n=push_n)
+        return Forces(macro_n=-value, end_n=value)
     if place == "contact_edge":
         return _edges_moved(recording, effect, parameters, value, whole)
     if place.endswith("_actuator"):
         return motor_forces(recording, axis, value, None)
     return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
+
+
+def _contact_changed(recording: Recording, pressing_n: np.ndarray, whole: bool) -> np.ndarray:
+    """Return what an effect of the contact adds to the force on the end; `whole`: a contact that would pull lets go.
+
+    A knee of 25 um beside a damping of 90 N s/m lets go twice as deep as the believed contact, and left 16 % of itself
+    at those instants.
+    """
+    joint = recording.believed.joint
+    if joint is None or recording.side is None:
+        return 0.0 * pressing_n
+    if whole:
+        damping = contact_damping_n_s_per_m(recording.believed)
+        there_n = recording.side * _contact_of(recording).push_n(joint, damping)
+        pressing_n = np.maximum(pressing_n, -there_n)
+    return recording.side * pressing_n
 
 
 def _commanded(recording: Recording, axis: str, effect: Effect, parameters: list[float]) -> Forces:

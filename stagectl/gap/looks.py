@@ -78,7 +78,13 @@ def _under(
     still = [group for group in known if group not in moving]
     explained = first.explained(still)
     first.evidence.forget_trials()
-    there, moved = settled(unsettled, noise, tuple(moved_by(first, known, group) for group in moving), crew)
+    there, moved, kept = settled(
+        unsettled,
+        noise,
+        tuple(moved_by(first, known, group) for group in moving),
+        tuple(first.term(group) for group in still),
+        crew,
+    )
     for _ in range(_FORETOLD_PASSES if still else 1):
         there = crew.here(
             lambda r: balance.foretold_under(r, balance.sum_of(balance.known_forces(r), explained(r))), there
@@ -88,7 +94,7 @@ def _under(
         first.judge.training_count,
         without=without,
         moved=moved,
-        kept=tuple(first.term(group) for group in still),
+        kept=kept,
         noise=noise_of(there, explained),
         crew=crew,
     )
