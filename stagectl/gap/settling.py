@@ -48,7 +48,7 @@ def settled(
     decides where a contact lets go: 16 % too little of it made a knee of 24 um one of 27. None goes further than is
     stated.
     """
-    if not any(r.side is not None and bool(np.any(r.side)) for r in recordings):
+    if not moved and not touches(recordings):
         return recordings, moved, beside
     crew = crew or Serial()
     out = {"left_m": 0.0, "right_m": 0.0, _DAMPING: 0.0}
@@ -127,11 +127,20 @@ def _changed(moved: Moved, ratio: float) -> Moved:
     return effect, place, {**values, first: values[first] * (1.0 + float(np.clip(ratio, -DEVIATION_SD, 1.0)))}
 
 
+def touches(recordings: Sequence[Recording]) -> bool:
+    """Tell whether the joint is ever believed to be in contact."""
+    return any(r.side is not None and bool(np.any(r.side)) for r in recordings)
+
+
 def moves_joint(search: Competition, group: Group) -> bool:
     """Tell whether an effect puts the joint elsewhere: what was learnt of contact has to be learnt again."""
+    return touches(search.evidence.recordings) and moves_readings(search, group)
+
+
+def moves_readings(search: Competition, group: Group) -> bool:
+    """Tell whether an effect puts readings or edges elsewhere by more than a column says."""
     term = search.term(group)
-    touches = any(r.side is not None and bool(np.any(r.side)) for r in search.evidence.recordings)
-    return touches and whole_of(term) and term.acts_on.endswith(("_sensor", "contact_edge"))
+    return whole_of(term) and term.acts_on.endswith(("_sensor", "contact_edge"))
 
 
 def moved_by(search: Competition, chosen: list[Group], group: Group) -> Moved:
