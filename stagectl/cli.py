@@ -165,6 +165,15 @@ SectionArgument = Annotated[
 ]
 PaperFolder = Annotated[Path, _option("Folder of the page.", "--out", metavar="FOLDER")]
 
+ServedProfile = Annotated[
+    str | None, typer.Argument(help="A name or a TOML file (default: the one served last).", metavar="[PROFILE]")
+]
+Socket = Annotated[Path | None, _option("Socket of the service.", metavar="PATH", envvar="STAGECTL_SOCKET")]
+TcpPort = Annotated[
+    int | None, _option("Listen on this port of 127.0.0.1 too, for clients with a token.", metavar="PORT")
+]
+StateFolder = Annotated[Path | None, _option("Folder of what survives a restart, and of the tokens.", metavar="FOLDER")]
+
 _PROFILE, _RUNS, _GAP, _PAPER = "oled-printer", Path("runs"), Path("gap"), Path("paper")
 
 
@@ -274,6 +283,22 @@ def home(
 ) -> None:
     """Home: the macro on its drive's index, then the micro on both edges of the joint."""
     _deliver("home", json, lambda voice: commands.motion.home(voice, profile, backend, runs, seed))
+
+
+@app.command(epilog=_epilog("stagectl serve my-stage.toml", "stagectl serve oled-printer --backend rig --tcp 8700"))
+def serve(
+    profile: ServedProfile = None,
+    backend: Wire = "auto",
+    seed: Seed = 1,
+    runs: Runs = _RUNS,
+    socket: Socket = None,
+    tcp: TcpPort = None,
+    state: StateFolder = None,
+    json: Json = False,
+) -> None:
+    """Serve a stage to clients, in the foreground, until SIGTERM or Ctrl-C; waits for hardware that is not there."""
+    work = commands.serve.serve
+    _deliver("serve", json, lambda voice: work(voice, profile, backend, runs, seed, socket, tcp, state))
 
 
 @app.command(epilog=_epilog("stagectl replay latest"))
