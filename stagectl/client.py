@@ -213,7 +213,7 @@ class Client:
                 headers={**lease, **(headers or {})},
                 params=params,
                 timeout=_TIMEOUT_S + more_s,
-                **({} if body is None else {"json": body.model_dump()}),
+                json=None if body is None else body.model_dump(),
             )
         except httpx.HTTPError as error:
             raise LinkError(

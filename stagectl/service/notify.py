@@ -14,19 +14,19 @@ class Notifier:
     """Sends datagrams to $NOTIFY_SOCKET; feeds the watchdog of $WATCHDOG_USEC, and only for news."""
 
     def __init__(self, environment: os._Environ | dict = os.environ, clock_s: Callable[[], float] = time.monotonic):
-        """Read the environment; opens a socket where there is somebody to tell."""
+        """Read the environment."""
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) if address else None
         self.watchdog_us = int(environment.get("WATCHDOG_USEC", "0") or 0)
         self._clock_s, self._fed_s, self._fed_at = clock_s, -1e9, -1
 
     def say(self, **fields: object) -> None:
         """Send fields such as READY=1 or STATUS=text; a manager that does not listen is no reason to fail."""
-        if self._socket is not None:
+        if self._address:
             text = "\n".join(f"{name}={str(value).replace(chr(10), ' ')}" for name, value in fields.items())
-            with contextlib.suppress(OSError):
-                self._socket.sendto(text.encode(), self._address)
+            with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as telling:
+                telling.setblocking(False)
+                telling.sendto(text.encode(), self._address)
 
     def feed(self, cycles_count: int) -> None:
         """Feed the watchdog, four times as often as needed; not while the count of cycles stands still."""

@@ -145,6 +145,7 @@ class StageLoop:
         if self._stage is not None and self._state is State.ARMED:
             self._come_to_rest()
         self._close_stage()
+        self._tick()
 
     def _tick(self) -> None:
         """Publish where things stand, and feed the watchdog as long as the servo's cycles, or else this loop, go on."""
