@@ -35,7 +35,8 @@ class Client:
 
     def __init__(self, socket_path: Path | None = None, *, tcp_port: int | None = None, token: str = ""):
         """Over the service's socket (default: where it usually is), or a port of this machine with a token."""
-        self.place = f"127.0.0.1:{tcp_port}" if tcp_port is not None else str(socket_path or default_socket())
+        self._path = None if tcp_port is not None else Path(socket_path or default_socket())
+        self.place = f"127.0.0.1:{tcp_port}" if tcp_port is not None else str(self._path)
         transport = None if tcp_port is not None else httpx.HTTPTransport(uds=self.place)
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         url = f"http://{self.place}" if tcp_port is not None else "http://stagectl"
@@ -205,6 +206,8 @@ class Client:
         params: dict[str, Any] | None = None,
         more_s: float = 0.0,
     ) -> httpx.Response:
+        if self._path is not None and not self._path.is_socket():
+            raise LinkError(f"{self.place}: no service has its socket there; is `stagectl serve` running?")
         lease = {"Stagectl-Lease": self.lease_token} if self.lease_token else {}
         try:
             answer = self._http.request(

@@ -33,6 +33,7 @@ _CODES: tuple[tuple[type[StagectlError], int], ...] = (
 _REFUSALS: dict[int | str, dict[str, Any]] = {
     code: {"model": messages.Failure, "description": text}
     for code, text in (
+        (400, "The body can't be read"),
         (401, "No token, or a wrong one (TCP only)"),
         (403, "The token's role may not do this"),
         (409, "Not possible in this state, or another command is under way"),

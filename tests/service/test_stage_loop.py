@@ -194,6 +194,24 @@ def test_a_lease_that_runs_out_stops_the_stage_and_is_a_fault(armed):
     assert armed.do("arm", messages.Arm()).stop == "FINISHED"
 
 
+def test_a_client_that_vanishes_in_mid_motion_stops_it(armed):
+    before = armed.loop._progress
+
+    def then_vanish(what, share):
+        if share > 0.3:
+            armed.now_s += 31.0
+        before(what, share)
+
+    armed.loop._stage._progress = then_vanish
+    key = armed.begin("move", messages.Move(target_m=0.1))
+    armed.until(lambda: armed.desk.command(key).state == "done")
+    armed.loop._stage._progress = before
+    armed.loop.step()
+    assert armed.desk.command(key).stop == Stop.LEASE.name
+    assert (armed.status.fault.kind, armed.status.fault.state) == (Stop.LEASE.name, "moving")
+    assert armed.status.positions.end_position_m < 0.09
+
+
 def test_a_lost_beam_is_a_fault_and_voids_the_homing(armed):
     armed.inject(Fault("beam_loss", duration_s=0.3, axis="both"))
     armed.until(lambda: armed.status.state == "fault")
