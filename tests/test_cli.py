@@ -55,6 +55,7 @@ COMMANDS = [
     ["runs", "export"],
     ["runs", "import"],
     ["runs", "plot"],
+    ["serve"],
     ["gap"],
     ["gap", "search"],
     ["gap", "apply"],
