@@ -7,6 +7,7 @@ the service refuses, with its text; LinkError where it doesn't answer.
 import contextlib
 import secrets
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +22,8 @@ from stagectl.service.places import default_socket
 _TIMEOUT_S = 5.0
 _WAIT_S = 5.0
 _RENEWALS_PER_LEASE = 4
+_REST_S, _LOOK_S = 30.0, 0.05
+_WITHOUT_POWER = ("off", "idle", "fault")
 _KINDS = {kind.__name__: kind for kind in (DriveError, LinkError, ProfileError, RecordError, RequestError, TimingError)}
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -103,7 +106,7 @@ class Client:
 
     @contextlib.contextmanager
     def lease(self, holder: str, duration_s: float = 2.0) -> Iterator[messages.TakenLease]:
-        """Hold the lease and renew it from a thread; leaving gives it back, and the stage comes to rest."""
+        """Hold the lease and renew it from a thread; leaving gives it back and waits until the stage has no power."""
         taken = self.take_lease(holder, duration_s)
         over = threading.Event()
         renewing = threading.Thread(target=self._renew_until, args=(over, duration_s), daemon=True)
@@ -115,6 +118,12 @@ class Client:
             renewing.join(_TIMEOUT_S)
             with contextlib.suppress(StagectlError):  # it may be over already, and the stage with it
                 self.give_lease_back()
+                self._await_rest()
+
+    def _await_rest(self) -> None:
+        give_up_s = time.monotonic() + _REST_S
+        while self.status().state not in _WITHOUT_POWER and time.monotonic() < give_up_s:
+            time.sleep(_LOOK_S)
 
     def _renew_until(self, over: threading.Event, duration_s: float) -> None:
         while not over.wait(duration_s / _RENEWALS_PER_LEASE):

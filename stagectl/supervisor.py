@@ -44,7 +44,9 @@ _SENSOR_TIMEOUT_S = 5.0
 _INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
 _TOUCH_TRIES = 4
 _JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
-_PLAN_SHARE = 0.9  # of the profile's limits that planned moves use
+PLAN_SHARE = 0.9
+"""Of the profile's limits that planned moves use."""
+
 _JERK_TIME_S = 0.1
 _QUICK_STOP_HOLD, _QUICK_STOP_OFF = 6, 2
 _STALE_SHARE = 1.0 / 3.0  # of the micro's way to a stop that each drive may use up before it misses a dead servo
@@ -766,10 +768,8 @@ class Supervisor:
 
     def _limits(self) -> trajectories.Limits:
         macro = self.profile.macro
-        acceleration = _PLAN_SHARE * min(macro.acceleration_limit_m_per_s2, 0.5 * macro.stop_deceleration_m_per_s2)
-        return trajectories.Limits(
-            _PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S
-        )
+        acceleration = PLAN_SHARE * min(macro.acceleration_limit_m_per_s2, 0.5 * macro.stop_deceleration_m_per_s2)
+        return trajectories.Limits(PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S)
 
     def move(self, target_m: float, law: str | None = None) -> Outcome:
         """Move the end to a position, jerk-limited; checked before the first cycle."""

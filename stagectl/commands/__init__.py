@@ -8,9 +8,35 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from stagectl.commands import demo, gap, gap_demo, gap_next, motion, planning, profiles, reproduce, runs, serve
+    from stagectl.commands import (
+        demo,
+        gap,
+        gap_demo,
+        gap_next,
+        jog_keys,
+        motion,
+        planning,
+        profiles,
+        remote,
+        reproduce,
+        runs,
+        serve,
+    )
 
-__all__ = ["demo", "gap", "gap_demo", "gap_next", "motion", "planning", "profiles", "reproduce", "runs", "serve"]
+__all__ = [
+    "demo",
+    "gap",
+    "gap_demo",
+    "gap_next",
+    "jog_keys",
+    "motion",
+    "planning",
+    "profiles",
+    "remote",
+    "reproduce",
+    "runs",
+    "serve",
+]
 
 
 def __getattr__(name: str) -> ModuleType:

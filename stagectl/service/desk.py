@@ -19,6 +19,7 @@ from stagectl.service.lease import Lease
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import Event, State
+from stagectl.service.view import jog_velocity_m_per_s
 
 _KEPT_ORDERS_COUNT = 1000
 
@@ -286,7 +287,7 @@ class Desk:
             raise Unfit(f"target_m is {body.target_m:g}: {travel}; give a position within it")
         if name == "jog" and not abs(body.distance_m) <= high_m - low_m:
             raise Unfit(f"distance_m is {body.distance_m:g}: {travel}; give a distance within it")
-        top = 0.9 * profile.macro.velocity_limit_m_per_s
+        top = jog_velocity_m_per_s(profile)
         if name == "jog_at" and not abs(body.velocity_m_per_s) <= top:
             raise Unfit(f"velocity_m_per_s is {body.velocity_m_per_s:g}: a jog may do {top:g} m/s; ask for less")
         if name == "identify" and profile.micro is None:

@@ -179,6 +179,16 @@ class Positions(BaseModel):
     error_m: float | None
 
 
+class Limits(BaseModel):
+    """What this stage may be asked for."""
+
+    travel_m: tuple[float, float]
+    velocity_m_per_s: float
+    jog_velocity_m_per_s: float
+    has_micro: bool
+    rate_hz: float
+
+
 class Status(BaseModel):
     """Everything that a client needs to know at a glance."""
 
@@ -193,6 +203,7 @@ class Status(BaseModel):
     waiting_for: str
     homed: bool
     phase: str
+    limits: Limits | None
     positions: Positions
     health: Health
     backlash: Backlash | None

@@ -26,7 +26,7 @@ from stagectl.service.remembered import Remembered, keep
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import Event, State
-from stagectl.service.view import BANNERS, backlash_message, health, positions
+from stagectl.service.view import BANNERS, backlash_message, health, limits, positions
 from stagectl.signals import Stop
 from stagectl.stage import choose, open_stage, present
 from stagectl.supervisor import Outcome, Supervisor
@@ -535,6 +535,7 @@ class StageLoop:
             waiting_for=self._waiting_for,
             homed=self._homed and status is not None,
             phase=Phase(int(status["phase"])).name if status is not None else "",
+            limits=limits(stage.profile if stage is not None else profile),
             positions=positions(status),
             health=health(status, profile.cycle.rate_hz if profile is not None else 0.0, self._late),
             backlash=self._remembered.backlash,

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
+from stagectl.profile import Profile
 from stagectl.service import messages
-from stagectl.supervisor import BacklashEstimate
+from stagectl.supervisor import PLAN_SHARE, BacklashEstimate
 
 BANNERS = {
     "hardware": "HARDWARE: what moves here is real",
@@ -29,6 +30,25 @@ def backlash_message(estimate: BacklashEstimate, run: str, profile_name: str, at
         run=run,
         profile_name=profile_name,
     )
+
+
+def limits(profile: Profile | None) -> messages.Limits | None:
+    """Say what a stage may be asked for."""
+    if profile is None:
+        return None
+    macro = profile.macro
+    return messages.Limits(
+        travel_m=macro.travel_m,
+        velocity_m_per_s=macro.velocity_limit_m_per_s,
+        jog_velocity_m_per_s=jog_velocity_m_per_s(profile),
+        has_micro=profile.micro is not None,
+        rate_hz=profile.cycle.rate_hz,
+    )
+
+
+def jog_velocity_m_per_s(profile: Profile) -> float:
+    """Return the fastest jog that a stage plans."""
+    return PLAN_SHARE * profile.macro.velocity_limit_m_per_s
 
 
 def finite(value: float) -> float | None:
