@@ -173,6 +173,14 @@ class Client:
         """Bring the stage to rest and take the power away; needs no lease."""
         return messages.Status.model_validate(self._ask("POST", "/v1/stop"))
 
+    def record(self, name: str = "request") -> messages.Status:
+        """Begin a run, where none is under way; needs no lease."""
+        return messages.Status.model_validate(self._ask("POST", "/v1/record", messages.StartRecord(name=name)))
+
+    def end_record(self) -> messages.Status:
+        """End the run that was asked for; needs no lease."""
+        return messages.Status.model_validate(self._ask("DELETE", "/v1/record"))
+
     def begin(self, name: str, body: BaseModel, key: str = "") -> messages.Command:
         """Send a command and don't wait; the same key again is the same command."""
         headers = {"Idempotency-Key": key or f"client-{secrets.token_hex(12)}"}

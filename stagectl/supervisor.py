@@ -20,6 +20,7 @@ from stagectl import jogging
 from stagectl import trajectory as trajectories
 from stagectl.backend import SEGMENT_ROWS, Backend, ServoLink
 from stagectl.errors import DriveError, LinkError, RecordError, RequestError, StagectlError, TimingError
+from stagectl.flight_recorder import FlightRecorder
 from stagectl.plant import PLANT_PARAMETERS
 from stagectl.profile import AxisName, Profile
 from stagectl.record import Recorder
@@ -166,7 +167,7 @@ class Supervisor:
         *,
         lease_left_s: Callable[[], float] = lambda: math.inf,
         observe: Callable[[np.ndarray], None] = lambda rows: None,
-        record: Callable[[Path, dict[str, Any]], Recorder] = Recorder,
+        record: Callable[[Path, dict[str, Any]], Recorder | FlightRecorder] = Recorder,
     ):
         """Hold the parts; nothing is touched before `connect`.
 
@@ -178,7 +179,7 @@ class Supervisor:
         self._lease_left_s, self._observe, self._record = lease_left_s, observe, record
         self._master: Master | None = None
         self._link: ServoLink | None = None
-        self._recorder: Recorder | None = None
+        self._recorder: Recorder | FlightRecorder | None = None
         self._counter = 0
         self._segment_number = 0
         self._segment_free = 0
@@ -224,7 +225,7 @@ class Supervisor:
         return self._master
 
     @property
-    def recorder(self) -> Recorder:
+    def recorder(self) -> Recorder | FlightRecorder:
         """The run's recorder; RequestError before `connect`."""
         if self._recorder is None:
             raise RequestError("the stage is not connected; call connect() first")
@@ -362,7 +363,7 @@ class Supervisor:
             "laws": list(LAW_NAMES),
         }
         self._recorder = self._record(self.folder, manifest)
-        self._link = self.backend.start_servo(profile, self.mappings, self.folder)
+        self._link = self.backend.start_servo(profile, self.mappings, self._recorder.recovery_folder)
         self._belief[...] = self._link.tracker_belief
         self._recorder.save_snapshot(self._link.snapshot)
         master.nmt(0, "start")
@@ -559,7 +560,7 @@ class Supervisor:
             if not quiet:
                 raise
 
-    def _end_run(self, link: ServoLink, recorder: Recorder, end: dict[str, Any]) -> None:
+    def _end_run(self, link: ServoLink, recorder: Recorder | FlightRecorder, end: dict[str, Any]) -> None:
         """End the servo, which first stops what moves, and put its last rows on the disk."""
         with undisturbed():
             self._link = None

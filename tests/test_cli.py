@@ -63,6 +63,7 @@ COMMANDS = [
     ["fault"],
     ["lease"],
     ["backend"],
+    ["record"],
     ["log"],
     ["gap"],
     ["gap", "search"],

@@ -29,10 +29,10 @@ def served(socket: Path | None, in_place: bool) -> bool:
     return not in_place and is_served(socket or default_socket())
 
 
-def checked(name: str, **values: object) -> BaseModel:
+def checked(kind: str, /, **values: object) -> BaseModel:
     """Make a request of the API; RequestError where a value can't be in it."""
     try:
-        return getattr(messages, name)(**values)
+        return getattr(messages, kind)(**values)
     except ValidationError as error:
         problem = error.errors()[0]
         place = ".".join(str(part) for part in problem["loc"]).replace("_", "-")
@@ -286,6 +286,25 @@ def lease(voice: Voice, socket: Path | None, hold: bool) -> Answer:
 def _still_ours(seen: messages.Status, holder: str) -> None:
     if seen.lease is None or seen.lease.holder != holder:
         raise RequestError("the lease was lost: it was not renewed in time; the stage was stopped")
+
+
+def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> Answer:
+    """Show what is recorded, begin a run, or end the one that was asked for."""
+    import time
+
+    with connected(socket) as stage:
+        if end or name is not None:
+            if end:
+                stage.end_record()
+            else:
+                stage.record(checked("StartRecord", name=name).name)  # pyright: ignore[reportAttributeAccessIssue]
+            time.sleep(_POLL_S)
+        found = stage.status().recording
+    text = "nothing: the stage is not connected"
+    if found is not None:
+        text = f"{found.run}, begun by {found.trigger}" if found.run else "the last seconds only, in memory"
+    shown = [escape(text), *([f"[red]{escape(found.trouble)}[/]"] if found is not None and found.trouble else [])]
+    return Answer({"recording": None if found is None else found.model_dump()}, shown)
 
 
 def backend(voice: Voice, socket: Path | None, token: str | None, name: str | None) -> Answer:

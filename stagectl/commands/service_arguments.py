@@ -40,6 +40,8 @@ LinesCount = Annotated[int, option("How many lines.", "--lines", min=1, max=1000
 LooksCount = Annotated[int | None, option("End after so many looks (default: Ctrl-C).", "--count", min=1)]
 DoAcknowledge = Annotated[bool, option("Take note of it; enables nothing.", "--acknowledge")]
 Hold = Annotated[bool, option("Take the lease and hold it until Ctrl-C.", "--hold")]
+RecordName = Annotated[str | None, option("Begin a run of this name.", "--name", metavar="NAME")]
+EndRecord = Annotated[bool, option("End the run that was asked for.", "--end")]
 World = Annotated[str | None, typer.Argument(help="auto | hardware | rig.", metavar="[WORLD]")]
 
 
@@ -97,6 +99,12 @@ def lease(hold: Hold = False, socket: Socket = None, json: Json = False) -> None
 def backend(world: World = None, lease: LeaseToken = None, socket: Socket = None, json: Json = False) -> None:
     """Show which world the service works in, or change it; without power only."""
     deliver("backend", json, lambda voice: commands.remote.backend(voice, socket, lease, world), compiles=False)
+
+
+@service_app.command(epilog=epilog("stagectl record", "stagectl record --name warm-up", "stagectl record --end"))
+def record(name: RecordName = None, end: EndRecord = False, socket: Socket = None, json: Json = False) -> None:
+    """Show what the service records, begin a run, or end it; powered motions are recorded without asking."""
+    deliver("record", json, lambda voice: commands.remote.record(voice, socket, name, end), compiles=False)
 
 
 @service_app.command(epilog=epilog("stagectl log --lines 50"))

@@ -207,6 +207,18 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
         desk.ask_to_stop("a client asked to stop")
         return desk.status()
 
+    @app.post("/v1/record", status_code=202, dependencies=_OPERATES)
+    async def record(body: messages.StartRecord) -> messages.Status:
+        """Begin a run, where none is under way. Needs no lease; motions are recorded without asking."""
+        desk.ask_to_record(body.name)
+        return desk.status()
+
+    @app.delete("/v1/record", status_code=202, dependencies=_OPERATES)
+    async def end_record() -> messages.Status:
+        """End the run that was asked for. Needs no lease."""
+        desk.ask_to_record("")
+        return desk.status()
+
     @app.get("/v1/commands/{key}", responses={404: {"model": messages.Failure}})
     async def command(
         key: messages.Key, wait_s: Annotated[float, Query(ge=0.0, le=_WAIT_MOST_S, allow_inf_nan=False)] = 0.0

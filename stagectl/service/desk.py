@@ -108,6 +108,7 @@ class Desk:
         self._waiting: Order | None = None
         self._stop_reason = ""
         self._stop = threading.Event()
+        self._record_request: str | None = None
         self._closed = False
         self._status: messages.Status | None = None
         self._state = State.OFF
@@ -163,6 +164,14 @@ class Desk:
             self._closed = True
             self._drop_waiting("the service is ending")
 
+    def next_record_request(self) -> str | None:
+        """Take the name of a run that somebody asked for, "" for its end; None where nobody asked."""
+        if self._record_request is None:
+            return None
+        with self._lock:
+            asked, self._record_request = self._record_request, None
+            return asked
+
     # ---- what clients do -------------------------------------------------------------------------------------
 
     def status(self) -> messages.Status:
@@ -216,6 +225,17 @@ class Desk:
         with self._lock:
             self._drop_waiting(reason)
         self._log.say("stop", reason)
+
+    def ask_to_record(self, name: str) -> None:
+        """Begin a run, or end the one that was asked for (""); needs no lease. Errors: Busy, Ending."""
+        with self._lock:
+            self._refuse_when_closed()
+            if self._record_request is not None:
+                raise Busy("another client asks the same just now; ask again")
+            if self._state is State.OFF:
+                raise Busy("there is nothing to record: the stage is not connected")
+            self._record_request = name
+            self._log.say("record", name or "end")
 
     def _drop_waiting(self, reason: str) -> None:
         waiting, self._waiting = self._waiting, None

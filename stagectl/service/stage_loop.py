@@ -18,10 +18,11 @@ from stagectl.profile import Profile, load_profile
 from stagectl.requests import Phase
 from stagectl.ring import RingReader, writer_alive
 from stagectl.run_folder import give_back
-from stagectl.service import faults, messages, states
+from stagectl.service import faults, messages, recording, states
 from stagectl.service.desk import Desk, Order
 from stagectl.service.exposition import Figures
 from stagectl.service.notify import Notifier
+from stagectl.service.recording import Recording
 from stagectl.service.remembered import Remembered, keep
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
@@ -31,7 +32,7 @@ from stagectl.signals import Stop
 from stagectl.stage import choose, open_stage, present
 from stagectl.supervisor import Outcome, Supervisor
 
-_RETRY_S = 2.0
+_RETRY_S, _RETRY_AFTER_FAILURE_S = 2.0, 5.0
 _CONNECT_S = 240.0  # a cold compile cache on a slow host
 _CLOSE_S = 60.0  # coming to rest, rows to the disk
 _LATENESS_EVERY_S = 0.5
@@ -66,11 +67,11 @@ class StageLoop:
         remembered: Remembered,
         notifier: Notifier,
         figures: Figures,
-        record: Callable[..., Any] | None = None,
     ):
         """Hold the parts; `run` opens the stage."""
         self.settings, self.desk, self._log, self._notifier, self._figures = settings, desk, log, notifier, figures
         self._remembered = remembered
+        self._recording = Recording(settings.runs_root, log)
         self._began_s = time.monotonic()
         self._profile_asked, self._backend_asked = settings.profile, settings.backend
         self._profile: Profile | None = None
@@ -80,7 +81,7 @@ class StageLoop:
         self._fault: messages.Fault | None = None
         self._waiting_for = "the service has just begun"
         self._retry_at_s = 0.0
-        self._leaving = self._rereading = self._opening = False
+        self._leaving = self._rereading = self._opening = self._breaking = False
         self._scope = Scope(1000.0)
         self._homed = False
         self._order: Order | None = None
@@ -102,6 +103,7 @@ class StageLoop:
 
     def run(self) -> None:
         """Work until `leave`; then bring the stage to rest and close its run."""
+        self._recording.begin_pruning()
         try:
             while not self._leaving:
                 self.step()
@@ -145,13 +147,28 @@ class StageLoop:
         if self._stage is not None and self._state is State.ARMED:
             self._come_to_rest()
         self._close_stage()
+        self._recording.end_pruning()
         self._tick()
 
     def _tick(self) -> None:
         """Publish where things stand, and feed the watchdog as long as the servo's cycles, or else this loop, go on."""
+        self._heed_record_requests()
         status = self._view()
         self.desk.publish(status, self._state)
         self._notifier.feed(status.health.cycles_count if self._stage is not None else time.monotonic_ns())
+
+    def _heed_record_requests(self) -> None:
+        """Begin or end a run that a client asked for; motions go on meanwhile."""
+        asked, stage = self.desk.next_record_request(), self._stage
+        if asked is None or stage is None or self._opening:
+            return
+        try:
+            if asked == "":
+                self._recording.end(recording.REQUEST, text="a client asked for its end")
+            else:
+                self._recording.begin(asked, recording.REQUEST, stage.link.now_t_ns())
+        except RequestError as error:
+            self._log.say("record_lost", str(error))
 
     def _progress(self, what: str, share: float) -> None:
         """Hear from the supervisor that a motion goes on; the place where a stop comes in."""
@@ -170,6 +187,14 @@ class StageLoop:
             self._log.say("state", text, state=self._state.value, before=before.value, because=event.value)
             self._notifier.say(STATUS=f"{self._state.value}, {self._backend or 'no world'}")
         self.desk.powered = self._state in states.POWERED
+        if before in states.POWERED and not self.desk.powered and not self._breaking:
+            self._recording.end(recording.ARM, *self._why(event))
+
+    def _why(self, event: Event) -> tuple[str, str]:
+        """Return how the run of a powered stage ended: the Stop's name, and the sentence."""
+        if event is Event.TRIPPED and self._fault is not None:
+            return self._fault.kind, f"{self._fault.what}: {self._fault.values}"
+        return "", ""
 
     # ---- opening and closing ---------------------------------------------------------------------------------
 
@@ -207,12 +232,14 @@ class StageLoop:
                 manifest={"banner": BANNERS[self._backend], "backend_asked": self._backend_asked},
                 lease_left_s=self.desk.lease_left_s,
                 observe=self._observe,
+                record=self._recording.factory(profile),
             )
             folder = stage.folder
             self._figures.begin_servo()
             self._scope = Scope(profile.cycle.rate_hz)
             self.desk.scope = self._scope
             stage.__enter__()
+            self._stage, self._homed, self._waiting_for = stage, False, ""
         except Leaving:
             return
         except LinkError as error:
@@ -224,10 +251,10 @@ class StageLoop:
         finally:
             self._opening = False
             self._notifier.allow(0.0)
-            if folder is not None:
+            if folder is not None and self._stage is None:
                 give_back(folder)
-            self._retry_at_s = time.monotonic() + _RETRY_S
-        self._stage, self._homed, self._waiting_for = stage, False, ""
+                self._recording.discard(folder)
+            self._retry_at_s = time.monotonic() + _RETRY_AFTER_FAILURE_S
         self.desk.profile = stage.profile
         self._keep(profile=str(profile.source_path), profile_name=profile.name, backend=self._backend)
         self._enter(Event.CONNECTED, stage.backend.description)
@@ -269,6 +296,7 @@ class StageLoop:
             except StagectlError as error:
                 self._log.say("closing", str(error), kind=type(error).__name__)
             give_back(stage.folder)
+            self._recording.forget()
             self._notifier.allow(0.0)
         if states.TRANSITIONS.get((self._state, Event.LET_GO)) is not None and self._state is not State.FAULT:
             self._enter(Event.LET_GO)
@@ -364,14 +392,17 @@ class StageLoop:
 
     def _trip(self, fault: messages.Fault) -> None:
         self._fault = fault
+        self._recording.save_last(fault.kind)
         self._enter(Event.TRIPPED, fault.what)
         self._log.say("fault", fault.what, **fault.model_dump(exclude={"what", "at"}))
         self._figures.fault(fault.kind)
 
     def _break(self, error: StagectlError) -> None:
         """What broke on this side: bring the stage to rest, let go of it, and say so."""
+        self._breaking = True  # the run ends when the last rows are in it
         self._trip(faults.of_error(error, self._state, now_text(), self._next_fault()))
         self._close_stage()
+        self._breaking = False
 
     def _next_fault(self) -> int:
         count = self._remembered.faults_count + 1
@@ -424,21 +455,24 @@ class StageLoop:
         if event in (Event.ARM, Event.MOVE, Event.IDENTIFY) and not self._homed:
             raise RequestError(f"{order.name}: the stage is not homed since it was connected; home it first")
         stage.allow_motion()
+        if self._state is State.IDLE:
+            self._recording.begin(order.name, recording.ARM, stage.link.now_t_ns())
+        folder = self._recording.folder(stage.folder)
         self._enter(event, order.name)
         outcome = work(stage)
         if order.name == "home":
             self._homed = outcome.finished
         self._settle(order.name)
-        backlash = self._kept_backlash(outcome) if order.name in ("home", "identify") else None
-        order.finish(outcome.text, outcome.stop.name, str(stage.folder), backlash)
+        backlash = self._kept_backlash(outcome, folder.name) if order.name in ("home", "identify") else None
+        order.finish(outcome.text, outcome.stop.name, str(folder), backlash)
         self._log.say("command_done", outcome.text, name=order.name, key=order.key, stop=outcome.stop.name)
         return outcome
 
-    def _kept_backlash(self, outcome: Outcome) -> messages.Backlash | None:
+    def _kept_backlash(self, outcome: Outcome, run: str) -> messages.Backlash | None:
         estimate, stage = outcome.backlash, self._stage
         if estimate is None or not outcome.finished or not estimate.identifiable or stage is None:
             return None
-        found = backlash_message(estimate, stage.folder.name, stage.profile.name, now_text())
+        found = backlash_message(estimate, run, stage.profile.name, now_text())
         self._keep(backlash=found)
         return found
 
@@ -542,18 +576,10 @@ class StageLoop:
             fault=self._fault,
             lease=self.desk.lease_state(),
             command=order.message() if order is not None else None,
-            recording=self._recording(),
+            recording=self._recording.message(),
             remarks=list(stage.remarks) if stage is not None else [],
             version=_VERSION,
             uptime_s=time.monotonic() - self._began_s,
-        )
-
-    def _recording(self) -> messages.Recording | None:
-        stage = self._stage
-        if stage is None:
-            return None
-        return messages.Recording(
-            run=stage.folder.name, trigger="always", rows_count=stage.recorder.rows_count, trouble=""
         )
 
 

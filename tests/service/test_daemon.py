@@ -189,7 +189,7 @@ def test_sigterm_in_mid_motion_brings_the_stage_to_rest_and_closes_the_run(tmp_p
             daemon.until(lambda: abs(daemon.plant["macro_velocity_m_per_s"]) > 0.05, "speed")
             daemon.process.terminate()
             assert daemon.process.wait(30.0) == 0
-        (folder,) = daemon.runs.iterdir()
+        (folder,) = daemon.runs.glob("*-service-arm")
         run = read_run(folder)
         assert run.manifest["record"]["state"] == "closed"
         assert run.manifest["banner"].startswith("SOFTWARE RIG")
@@ -219,7 +219,7 @@ def test_kill_9_of_the_daemon_stops_the_stage_and_loses_no_row(tmp_path):
         (ring,) = rings
         daemon.until(lambda: not ring.exists(), "rows saved")
         assert not writer_alive(ring)
-        (folder,) = daemon.runs.iterdir()
+        (folder,) = daemon.runs.glob("*-service-arm")
         record = read_run(folder).manifest["record"]
         assert (record["state"], record["rows_lost_count"]) == ("recovered", 0)
     finally:
