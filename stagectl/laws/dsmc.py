@@ -55,6 +55,9 @@ LAW = np.dtype(
     ]
 )
 
+LINEAR_STATES = ("error_integral_m_s",)
+"""What a cycle leaves to the next about e = 0; the adaptive gain counts there as a parameter (s = 0)."""
+
 _PARK_BANDWIDTH_HZ = 15.0
 _BUMP_S = 0.02
 

@@ -46,6 +46,11 @@ LAW = np.dtype(
     ]
 )
 
+LINEAR_STATES = tuple(
+    f"{axis}_{name}" for axis in ("precision", "macro") for name in ("integral_m", "error_m", "error_rate_m_per_s")
+)
+"""What a cycle leaves to the next about e = 0."""
+
 _POSITION_RATIO = 0.25
 _INTEGRAL_RATIO = 0.1
 _FILTER_RATIO = 8.0  # the difference is smoothed this much above the velocity loop
