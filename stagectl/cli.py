@@ -165,7 +165,17 @@ SectionArgument = Annotated[
 ]
 PaperFolder = Annotated[Path, _option("Folder of the page.", "--out", metavar="FOLDER")]
 
+BudgetRun = Annotated[
+    str | None,
+    typer.Argument(
+        help="A run to hold the prediction against: its folder, its name, or 'latest' (default: the profile's machine, "
+        "simulated).",
+        metavar="[RUN]",
+    ),
+]
+
 _PROFILE, _RUNS, _GAP, _PAPER = "oled-printer", Path("runs"), Path("gap"), Path("paper")
+_BUDGET = Path("budget")
 
 
 def _version(wanted: bool) -> None:
@@ -286,6 +296,20 @@ def replay(run: RunArgument, runs: Runs = _RUNS, json: Json = False) -> None:
 def reproduce(section: SectionArgument = None, out: PaperFolder = _PAPER, json: Json = False) -> None:
     """Run the paper that the control law comes from, as printed and as corrected, beside its own numbers."""
     _deliver("reproduce", json, lambda voice: commands.reproduce.show(voice, section, out))
+
+
+@app.command(epilog=_epilog("stagectl budget oled-printer", "stagectl budget my-stage.toml latest --json"))
+def budget(
+    profile: ProfileArgument = _PROFILE,
+    run: BudgetRun = None,
+    law: Law = None,
+    seed: Seed = 1,
+    runs: Runs = _RUNS,
+    out: PaperFolder = _BUDGET,
+    json: Json = False,
+) -> None:
+    """Say what the end's error is made of, predicted beside measured, how little is possible, what to improve next."""
+    _deliver("budget", json, lambda voice: commands.budget.show(voice, profile, run, law, seed, runs, out))
 
 
 @profile_app.command("check", epilog=_epilog("stagectl profile check my-stage.toml"))

@@ -27,7 +27,7 @@ _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _NM = 1e9
 _LEAST_WALK_RATIO = 1e-5  # of the sensor's noise: a filter without any drift has no integral action
 _LEAST_EFFORT = 1e-9  # squared: cheap control, not free
-_FREQUENCIES_COUNT = 600
+_FREQUENCIES_COUNT = 300
 _LOWEST_RATIO = 1e-4  # of half the sampling rate
 _STARTS = ((0.01, 0.03), (0.003, 0.01))  # drift of a filter, price of force, in units of what the noise could be
 _SEARCH: Any = {"xatol": 1e-3, "fatol": 1e-5, "maxfev": 150}
@@ -229,10 +229,13 @@ class Loop:
         a, command, _ = self._closed()
         state = np.zeros(a.shape[0])
         state[2 : 2 + self._commands] = state[-1] = force_n * self._newton
+        between = np.zeros((len(self._between), state.size))
+        for k, (_, _, row, now) in enumerate(self._between):
+            between[k, : row.size] = row
+            between[k] += now * command
         peak = 0.0
         for _ in range(_STEP_PERIODS):
-            for _, _, row, now in self._between:
-                peak = max(peak, abs(float(row @ state[: row.size]) + now * float(command @ state)))
+            peak = max(peak, float(np.max(np.abs(between @ state))))
             state = a @ state
         return peak / _NM
 
