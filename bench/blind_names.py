@@ -77,7 +77,7 @@ def _angle(ours: Mapping[str, float]) -> float:
 
 
 def _loss_at_100_n(ours: Mapping[str, float]) -> float:
-    # F_s tanh(F / F_s) = F - F^3 / (3 F_s^2) + ...: the truth's law is the first two terms
+    # F - F^3 / (3 F_s^2), in the truth with the loss at one force
     force_n = ours.get("saturation_n", math.nan)
     return _REFERENCE_N**2 / (3.0 * force_n**2) if force_n else math.nan
 

@@ -1,5 +1,7 @@
 """Shipped profiles and machines, read once."""
 
+import signal
+
 import pytest
 from hypothesis import settings
 
@@ -8,6 +10,10 @@ from stagectl.profile import load_profile
 
 settings.register_profile("stagectl", deadline=None)  # a first call compiles
 settings.load_profile("stagectl")
+
+# A shell that starts us in the background, or `nohup`, has these ignored, and what we start would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")

@@ -107,7 +107,11 @@ WORKED: dict[str, list[Case]] = {
     "backlash_wear": [Case((100.0, 2e-8), 1e-6), Case((0.0, 2e-8), 0.0)],
     # ---- drive ----
     "force_constant_error": [Case((40.0, -0.01), -0.4), Case((-5.0, 0.2), -1.0)],
-    "force_constant_saturation": [Case((100.0, 100.0), -23.840584404423511), Case((-100.0, 100.0), 23.840584404423511)],
+    "force_constant_saturation": [
+        Case((90.0, 100.0), -24.3),
+        Case((-90.0, 100.0), 24.3),
+        Case((200.0, 50.0), -500.0 / 3.0),
+    ],
     "amplifier_dead_band": [Case((0.05, 0.02), -0.02), Case((0.01, 0.02), -0.01), Case((-1.0, 0.02), 0.02)],
     # a step seen for one time constant: 1 - 1/e is reached, on average as much is missing
     "current_loop_lag": [

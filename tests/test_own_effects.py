@@ -20,10 +20,10 @@ from stagectl.errors import ProfileError
 from stagectl.gap import balance, grids
 from stagectl.gap.application import applied
 from stagectl.gap.believed import load_believed
-from stagectl.gap.log import Log
 from stagectl.gap.workflow import find
 from stagectl.profile import PROFILES_FOLDER, load_profile
 from stagectl.record import read_manifest
+from tests.hill_in_the_guide import HILL, HILL_AXIS, hill_log
 from tests.stage import followed, rms, true_error_m, with_values
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "own-effects.md"
@@ -156,70 +156,26 @@ def test_servo_and_replay_have_the_law_without_its_file(stage, tmp_path):
 
 # ---- gap ----------------------------------------------------------------------------------------------------------
 
-BUMP = (
-    "import numpy as np\nfrom stagectl.effects import effect\n\n\n"
-    '@effect(places=("macro_force",), force_n=(-100.0, 100.0), width_m=(1e-3, 9e-3), linear=("force_n",), '
-    'symptom="a hill at zero", reference="this test")\n'
-    "def scratch_in_the_guide(position_m, force_n, width_m):\n"
-    '    """A hill in the guide: F = A exp(-(x / w)^2)."""\n'
-    "    ratio = position_m / width_m\n    return force_n * np.exp(-ratio * ratio)\n"
-)
-OBSERVED = """name = "axis"
-effect_files = ["bump.py"]
-[cycle]
-rate_hz = 1000.0
-latch_s = 0.0
-[macro]
-mass_kg = 40.2
-mass_sd_kg = 0.4
-travel_m = 0.1
-[sensor]
-noise_m = 5e-9
-[[effects]]
-name = "viscous_friction"
-acts_on = "macro_force"
-damping_n_s_per_m = 33.0
-"""
-
-
-def _log(name: str, seed: int) -> Log:
-    """An axis of 40 kg that runs over a hill of 3 N, 5 mm wide, under a controller of its own; semi-implicit."""
-    random = np.random.default_rng(seed)
-    h, count, parts = 1e-3, 8000, 10
-    t = np.arange(count) * h
-    reference = 0.02 * np.sin(2.0 * np.pi * (0.4 + 0.1 * seed) * t) + 0.004 * np.sin(2.0 * np.pi * 2.3 * t + seed)
-    speed = np.gradient(reference, h)
-    x, v, seen, command = reference[0], speed[0], np.zeros(count), np.zeros(count)
-    slow, decay = 0.0, np.exp(-2.0 * np.pi * h)
-    for k in range(count):
-        slow = decay * slow + 0.05 * np.sqrt(1.0 - decay * decay) * random.standard_normal()
-        seen[k] = x + 5e-9 * random.standard_normal()
-        command[k] = 4.0e4 * (reference[k] - seen[k]) + 2.5e3 * (speed[k] - v)
-        for _ in range(parts):
-            v += (command[k] + 3.0 * np.exp(-((x / 5e-3) ** 2)) - 30.0 * v + slow) / 40.0 * h / parts
-            x += v * h / parts
-    return Log(name, h, seen, command, np.ones(count, bool), "1", reference_m=reference)
-
 
 def test_the_gap_workflow_finds_it_and_writes_it_into_the_profile(tmp_path):
-    (tmp_path / "bump.py").write_text(BUMP)
-    (tmp_path / "axis.toml").write_text(OBSERVED)
+    (tmp_path / "hill.py").write_text(HILL)
+    (tmp_path / "axis.toml").write_text(HILL_AXIS)
     believed = load_believed(tmp_path / "axis.toml")
     assert believed.own_effects == ("scratch_in_the_guide",)
-    findings = find(believed, [_log("run 1", 1)], [_log("run 2", 2)], nulls_count=20)
+    findings = find(believed, [hill_log("run 1", 1)], [hill_log("run 2", 2)], nulls_count=20)
     (named,) = findings.named
     assert (named.name, named.parameters["force_n"]) == ("scratch_in_the_guide", pytest.approx(3.0, rel=0.1))
     assert named.parameters["width_m"] == pytest.approx(5e-3, rel=0.1)
-    text = applied(OBSERVED, findings, candidates=True, date="2026-11-20")
+    text = applied(HILL_AXIS, findings, candidates=True, date="2026-11-20")
     (tmp_path / "axis.toml").write_text(text)
     assert load_believed(tmp_path / "axis.toml").effects[1]["name"] == "scratch_in_the_guide"
 
 
 def test_a_search_tries_the_own_effects_of_its_own_profile_only(tmp_path):
-    (tmp_path / "bump.py").write_text(BUMP)
-    (tmp_path / "axis.toml").write_text(OBSERVED)
+    (tmp_path / "hill.py").write_text(HILL)
+    (tmp_path / "axis.toml").write_text(HILL_AXIS)
     mine = load_believed(tmp_path / "axis.toml")
-    log = _log("run 1", 1)
+    log = hill_log("run 1", 1)
     assert len(grids.grids_for([balance.recording_of(log, mine)])["scratch_in_the_guide"]) == 12
     others = dataclasses.replace(mine, own_effects=())
     assert grids.grids_for([balance.recording_of(log, others)])["scratch_in_the_guide"] == []

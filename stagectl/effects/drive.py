@@ -31,11 +31,17 @@ def force_constant_error(motor_force_n, error_ratio):
     searched=("saturation_n",),
     shown_by="acceleration",
     symptom="odd in the motor's force, with its cube: the force constant falls where the current is large",
-    reference="Gieras, Piech, Zhou, Linear Synchronous Motors, section 3.6: iron that saturates; tanh as its curve",
+    reference="Gieras, Piech, Zhou, Linear Synchronous Motors, section 3.6: iron that saturates, alike for both signs",
 )
 def force_constant_saturation(motor_force_n, saturation_n):
-    """Force that saturates: in all F_s tanh(F / F_s), so F_s tanh(F / F_s) - F is added, about -F^3 / (3 F_s^2)."""
-    return saturation_n * np.tanh(motor_force_n / saturation_n) - motor_force_n
+    """Force constant that falls with the square of the force: in all F - F^3 / (3 F_s^2), and 2 F_s / 3 beyond F_s.
+
+    The first term that symmetry leaves: a curve such as F_s tanh(F / F_s) begins with it. At F_s more current brings no
+    more force.
+    """
+    held_n = np.minimum(np.maximum(motor_force_n, -saturation_n), saturation_n)
+    ratio = held_n / saturation_n
+    return held_n * (1.0 - ratio * ratio / 3.0) - motor_force_n
 
 
 @effect(

@@ -9,7 +9,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cache
 from typing import Any, Protocol, Self, TypeVar
 
@@ -131,11 +131,10 @@ class Dask:
                 f"--dask {address}: no dask scheduler answers there within {answer_s:g} s ({said}); start one with "
                 "`dask scheduler` and give the address that it prints, such as tcp://192.168.1.7:8786"
             ) from error
-        try:
+        with ExitStack() as refused:
+            refused.callback(self._client.close)
             self._check(answer_s)
-        except BaseException:
-            self._client.close()
-            raise
+            refused.pop_all()
 
     def _check(self, answer_s: float) -> None:
         """Refuse a cluster without workers, or with workers of another stagectl."""

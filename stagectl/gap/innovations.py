@@ -125,9 +125,11 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
 
 @compiled
 def filtered(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
-    """Return what the filter knows of (position, velocity, slow force) with each sample, what it foretold of (position,
-    velocity) before it, shapes (n, 3) and (n, 2), how well it knew the velocity, (n,), and minus twice the
-    log-likelihood of the samples."""
+    """Return (known, foretold, spread, unlikely): what the filter knows along the samples, and how likely they are.
+
+    known: position, velocity and slow force with each sample, shape (n, 3); foretold: position and velocity before it,
+    (n, 2); spread: standard deviation of the known velocity, m/s, (n,); unlikely: minus twice the log-likelihood.
+    """
     n = position_m.size
     h = period_s
     a, drive, p = _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)

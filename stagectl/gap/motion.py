@@ -1,7 +1,8 @@
-"""The motion that was measured, smoothed without delay, at the middles of equal parts of every sample interval.
+"""The motion that laws are evaluated along, at the middles of equal parts of every sample interval.
 
-Force laws are evaluated on it. Smoothing must not invent physics: a law with a step at reversal is taken on parts of
-an interval, and reversals and standstill themselves are left to the simulation (`slow`). Pure.
+First a rough one, smoothed without delay; then the one that the past foretells. Neither may invent physics: a law with
+a step at reversal is taken on parts of an interval, and reversals and standstill are left to the simulation (`slow`).
+Pure.
 """
 
 from dataclasses import dataclass
@@ -14,12 +15,12 @@ from stagectl.gap.innovations import filtered, moments
 
 _WINDOW = 21
 _ORDER = 3
+_SLOW_SDS = 6.0
+"""Below so many standard deviations the sign of a smoothed velocity is not trusted."""
+
 _UNSURE_SDS = 1.4
 """The same of what the filter knows of it: at 1.0 a Stribeck friction of 5 N drew a second name, at 2.0 a stage that is
 held still said nothing of what pushes it."""
-
-_SLOW_SDS = 6.0
-"""Below so many standard deviations the sign of a velocity is not trusted in the ranking stage."""
 
 _REST_SAMPLES = 10
 _REST_REACH = 12
@@ -34,7 +35,6 @@ class Motion:
     velocity_m_per_s: np.ndarray
     acceleration_m_per_s2: np.ndarray
     slow: np.ndarray
-    measured_m_per_s2: np.ndarray  # acceleration by the positions alone, shape (n,)
     at_samples: np.ndarray  # position, velocity, acceleration foretold for the samples themselves, shape (n, 3)
 
 
@@ -60,7 +60,7 @@ def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motio
     wide = (np.convolve(slow, np.ones(3), "same") > 0.5) | (
         np.convolve(rests, np.ones(2 * _REST_REACH + 1), "same") > 0.5
     )
-    return Motion(position, velocity, acceleration, wide, a, np.column_stack([x, v, a]))
+    return Motion(position, velocity, acceleration, wide, np.column_stack([x, v, a]))
 
 
 SLOW_FORCE_N = 0.05
@@ -94,4 +94,4 @@ def motion_under(
     unsure = np.min(np.abs(velocity), axis=1) < _UNSURE_SDS * spread_m_per_s
     unsure |= np.min(velocity, axis=1) * np.max(velocity, axis=1) <= 0.0  # where it turns round within the interval
     slow = rough.slow | (np.convolve(unsure, np.ones(3), "same") > 0.5)
-    return Motion(position, velocity, acceleration, slow, rough.measured_m_per_s2, at_samples)
+    return Motion(position, velocity, acceleration, slow, at_samples)

@@ -21,7 +21,6 @@ _STRETCH = 512
 _LOW, _HIGH = (0.06, 0.2), (0.3, 0.5)  # shares of the sample rate
 _WHITE_RATIO = 1.08
 
-
 Explained = Callable[[Recording], Forces]
 """What is thought to act in a recording beyond what is believed."""
 

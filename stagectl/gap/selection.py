@@ -1,7 +1,7 @@
 """Which hypotheses stay: rounds of competition, with thresholds from the workflow's own null.
 
-A term stays when it gains on the recordings it was fitted on AND on recordings that no fit saw, each beyond what the
-best of the whole library gains on noise, and when it explains a share of what is reducible at all. Pure.
+A term stays when it gains on all recordings together more than the best of the whole library does on noise and a share
+of what is reducible at all, and when recordings that no fit saw do not speak against it. Pure.
 """
 
 import itertools
@@ -43,7 +43,6 @@ ALIAS_SHARE = 0.002
 LATE_SHARE = 0.12
 """The share between two late readings: beside prompt commands they disagree on the velocity that both laws are made of,
 and a lag of 0.45 ms at d' 45 lost a tenth of its gain to a delay."""
-
 
 LOW_SPEED_SHARE = 0.02
 """Of a machine with more force noise than its sensors explain, no friction is an exact law: at speed, where a velocity
