@@ -8,9 +8,33 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from stagectl.commands import budget, demo, gap, gap_demo, gap_next, motion, planning, profiles, reproduce, runs
+    from stagectl.commands import (
+        budget,
+        demo,
+        gap,
+        gap_demo,
+        gap_next,
+        motion,
+        planning,
+        profiles,
+        reproduce,
+        runs,
+        tune,
+    )
 
-__all__ = ["budget", "demo", "gap", "gap_demo", "gap_next", "motion", "planning", "profiles", "reproduce", "runs"]
+__all__ = [
+    "budget",
+    "demo",
+    "gap",
+    "gap_demo",
+    "gap_next",
+    "motion",
+    "planning",
+    "profiles",
+    "reproduce",
+    "runs",
+    "tune",
+]
 
 
 def __getattr__(name: str) -> ModuleType:
