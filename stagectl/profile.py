@@ -277,6 +277,7 @@ class Control(Table):
     park_error_m: Annotated[float, above(0.0, 1.0)] = 100e-6
     pid_bandwidth_hz: Bandwidth = 50.0
     macro_damping_ratio: Annotated[float, within(0.1, 5.0)] = 0.8
+    macro_feed_forward_ratio: Annotated[float, within(0.0, 1.0)] = 1.0
     eta_ratio: Annotated[float, within(0.0, 100.0)] = 1.0
     gamma_ratio: Annotated[float, within(0.0, 100.0)] = 0.1
     sliding_ratio: Annotated[float, within(0.0, 100.0)] = 1.0

@@ -40,6 +40,7 @@ LAW = np.dtype(
         ("macro_damping_per_s", "f8"),
         ("precision_force_limit_n", "f8"),
         ("macro_force_limit_n", "f8"),
+        ("macro_feed_forward_ratio", "f8"),  # of the reference's acceleration
         ("park_error_m", "f8"),
         ("park_stiffness_per_s2", "f8"),
         ("park_damping_per_s", "f8"),
@@ -84,6 +85,7 @@ def init(profile: "Profile") -> np.ndarray:
     precise = profile.micro if profile.micro is not None else profile.macro
     law["precision_force_limit_n"] = precise.force_limit_n
     law["macro_force_limit_n"] = profile.macro.force_limit_n
+    law["macro_feed_forward_ratio"] = control.macro_feed_forward_ratio
     law["park_error_m"] = control.park_error_m
     w = 2.0 * np.pi * _PARK_BANDWIDTH_HZ
     law["park_stiffness_per_s2"] = w * w
@@ -188,5 +190,6 @@ def carrier(
     e = ahead.macro_position_m - (later.position_m - later.relative_position_m + gap_centre(q))
     de = ahead.macro_velocity_m_per_s - (later.velocity_m_per_s - later.relative_velocity_m_per_s)
     acceleration = later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
+    acceleration *= law.macro_feed_forward_ratio
     wanted = acceleration - law.macro_stiffness_per_s2 * e - law.macro_damping_per_s * de
     return between(mass_kg * wanted - known_n, low_n, high_n)

@@ -31,6 +31,7 @@ LAW = np.dtype(
         ("filter_ratio", "f8"),
         ("precision_force_limit_n", "f8"),
         ("macro_force_limit_n", "f8"),
+        ("macro_feed_forward_ratio", "f8"),  # of the reference's acceleration
         ("precision_integral_m", "f8"),
         ("macro_integral_m", "f8"),
         ("precision_error_m", "f8"),
@@ -71,6 +72,7 @@ def init(profile: "Profile") -> np.ndarray:
     precise = profile.micro if profile.micro is not None else profile.macro
     law["precision_force_limit_n"] = precise.force_limit_n
     law["macro_force_limit_n"] = profile.macro.force_limit_n
+    law["macro_feed_forward_ratio"] = control.macro_feed_forward_ratio
     return law
 
 
@@ -152,10 +154,9 @@ def carrier(
     law.macro_error_rate_m_per_s += law.filter_ratio * (rate - law.macro_error_rate_m_per_s)
     law.macro_error_m = error
     velocity_error = law.macro_error_rate_m_per_s + law.macro_position_per_s * error
+    acceleration = later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
     wanted = (
-        later.acceleration_m_per_s2
-        + 0.5 * dt_s * later.jerk_m_per_s3
-        - later.relative_acceleration_m_per_s2
+        law.macro_feed_forward_ratio * acceleration
         + law.macro_velocity_per_s * velocity_error
         + law.macro_integral_per_s2 * law.macro_integral_m
     )
