@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stagectl.compiled import compiled
-from stagectl.laws.reference import between, gap_centre
+from stagectl.laws.reference import between, felt_after_s, gap_centre, precise_current_loop_s
 from stagectl.signals import Record
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def precision(
     velocity_error = law.precision_error_rate_m_per_s + law.precision_position_per_s * error
     wanted = (
         later.acceleration_m_per_s2
-        + 0.5 * dt_s * later.jerk_m_per_s3
+        + felt_after_s(precise_current_loop_s(q), dt_s) * later.jerk_m_per_s3
         + law.precision_velocity_per_s * velocity_error
         + law.precision_integral_per_s2 * law.precision_integral_m
     )
@@ -154,7 +154,8 @@ def carrier(
     law.macro_error_rate_m_per_s += law.filter_ratio * (rate - law.macro_error_rate_m_per_s)
     law.macro_error_m = error
     velocity_error = law.macro_error_rate_m_per_s + law.macro_position_per_s * error
-    acceleration = later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
+    felt_s = felt_after_s(q.macro_current_loop_s, dt_s)
+    acceleration = later.acceleration_m_per_s2 + felt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
     wanted = (
         law.macro_feed_forward_ratio * acceleration
         + law.macro_velocity_per_s * velocity_error
