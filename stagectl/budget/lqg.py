@@ -5,7 +5,8 @@
 u is a held command that acts `delay_s` after its sample (any fraction of a cycle), d a force that drifts as a random
 walk, w a force noise held for a cycle, n the sensor's noise. The Kalman filter takes the newest sample before the
 command is made; the regulator is cheap control of the mean square of x between samples: what is left is the bound. A
-torque word rounds u: white, step^2 / 12, known to the filter, which is fed the word that was sent.
+torque word rounds u and pays the rest back with the next: a white rounding of variance step^2 / 12, differenced,
+known to the filter, which is fed the word that was sent.
 
 Inside, all is in periods, nanometres and the force that moves the mass by a nanometre per period squared. Pure.
 """
@@ -198,7 +199,6 @@ class Loop:
         by_force[[0, 1], [0, 1]] = 1.0
         by_force[2:size, 2] = 1.0
         by_force[size:] = np.eye(3)
-        by_rounding = np.concatenate([self._b, np.zeros(3)])
         around = self.around
         walk = around.force_drift_n_per_sqrt_s * self._walk_unit
         force = around.force_noise_n * self._newton
@@ -209,9 +209,10 @@ class Loop:
             "sensor noise": (np.outer(by_noise, by_noise) * self._sensor**2, (noise_now * self._sensor) ** 2, 0.0, 0.0),
             "force noise": (np.outer(held, held) * force**2, 0.0, force**2, 0.0),
             "force drift": (by_force @ _WALK @ by_force.T * walk**2, 0.0, 0.0, walk**2),
-            "torque step": (np.outer(by_rounding, by_rounding) * step**2, step**2, 0.0, 0.0),
         }
-        by_source, measured = {}, self._sensor**2
+        rounding, measured = self._of_rounding(a, command, step)
+        by_source = {"torque step": math.sqrt(max(rounding, 0.0)) / _NM}
+        measured += self._sensor**2
         for name, (covariance, in_command, in_force, in_walk) in spreads.items():
             state = solve_discrete_lyapunov(a, covariance)
             measured += float(state[0, 0])
@@ -223,6 +224,22 @@ class Loop:
             by_source[name] = math.sqrt(max(power, 0.0)) / _NM
         true = math.sqrt(sum(value**2 for value in by_source.values()))
         return Hold(true, math.sqrt(measured) / _NM, by_source, self.design, self.robustness())
+
+    def _of_rounding(self, a: np.ndarray, command: np.ndarray, step: float) -> tuple[float, float]:
+        """Return the power between samples and at them of a rounding that the next command pays back."""
+        size = a.shape[0]
+        by_command = np.concatenate([self._b, np.zeros(3)])
+        whole = np.zeros((size + 1, size + 1))  # the last state is the rounding before
+        whole[:size, :size] = a
+        whole[:size, size] = -by_command
+        new = np.concatenate([by_command, [1.0]]) * step
+        state = solve_discrete_lyapunov(whole, np.outer(new, new))
+        power = 0.0
+        for share, _, row, now in self._between:
+            full = np.concatenate([row, np.zeros(3)]) + now * command
+            full = np.concatenate([full, [-now]])
+            power += share * (float(full @ state @ full) + (now * step) ** 2)
+        return power, float(state[0, 0])
 
     def step_peak_m(self, force_n: float) -> float:
         """Return the greatest error after a step of force, m."""

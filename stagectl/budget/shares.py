@@ -127,7 +127,7 @@ def total_rms_m(
 
 
 def _of_noises(system: LinearSystem, noises: Noises, edge_hz: np.ndarray, is_true: bool) -> dict[str, np.ndarray]:
-    """Return the power by cells of SENSOR, STEP and FORCE, all white."""
+    """Return the power by cells of SENSOR and FORCE, white, and of STEP, white and differenced."""
     axes = of_columns(system.inputs)
     at_hz = np.sqrt(edge_hz[:-1] * edge_hz[1:])
     by_input = _responses(system, at_hz, "end_mean_m" if is_true else "end_position_m")
@@ -141,9 +141,12 @@ def _of_noises(system: LinearSystem, noises: Noises, edge_hz: np.ndarray, is_tru
         return np.abs(response) ** 2 * share * deviation**2
 
     seen = ("macro", "end")[: len(axes)]
+    # what a word is rounded by the next one owes (`stagectl.tick`): white, differenced
+    paid_back = np.abs(1.0 - np.exp(-2j * np.pi * at_hz * system.period_s)) ** 2
     return {
         SENSOR: sum((power(f"{name}_noise_m", noises.sensor_m) for name in seen), np.zeros(at_hz.size)),
-        STEP: sum((power(f"{axis}_rounding_n", noises.rounding_n[axis]) for axis in axes), np.zeros(at_hz.size)),
+        STEP: paid_back
+        * sum((power(f"{axis}_rounding_n", noises.rounding_n[axis]) for axis in axes), np.zeros(at_hz.size)),
         FORCE: sum((power(f"{axis}_force_n", noises.force_n.get(axis, 0.0)) for axis in axes), np.zeros(at_hz.size)),
     }
 

@@ -51,6 +51,7 @@ def show(
         "law": name,
         "asked": asdict(asked),
         "values": found.values,
+        "old_values": found.old_values,
         "before": _data(found.before),
         "after": _data(found.after),
         "page": folder / PAGE,

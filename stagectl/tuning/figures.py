@@ -7,7 +7,7 @@ from stagectl.drawing import STYLE, image_of, legend, panels_of, plain_log
 from stagectl.report import INK, MUTED, SERIES
 from stagectl.tuning.rules import Asked, Assessment, Tuned
 
-_DASHES = ("-", (0, (4, 2)), (0, (1, 1.5)))
+_DASHES = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (6, 1.5, 1, 1.5)))
 
 
 def gain_figure(tuned: Tuned, image_format: str = "svg") -> bytes:
@@ -49,7 +49,7 @@ def sensitivity_figure(tuned: Tuned, asked: Asked, image_format: str = "svg") ->
         axes.set_xlabel("frequency (Hz)")
         axes.set_ylabel("sensitivity |1 / (1 + L)|")
         plain_log(axes.xaxis)
-        legend(drawing, axes, columns=3)
+        legend(drawing, axes, columns=2)
         return image_of(drawing, image_format)
 
 

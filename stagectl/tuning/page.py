@@ -1,5 +1,7 @@
 """The page of a tuning, and its tables for the terminal."""
 
+import math
+
 from stagectl.budget.budget import STEP_N
 from stagectl.report import Figure, Quantity, Report, Section, Table
 from stagectl.tuning.figures import gain_figure, sensitivity_figure
@@ -19,29 +21,39 @@ def report(title: str, tuned: Tuned, asked: Asked) -> Report:
 
 
 def verdict(tuned: Tuned) -> str:
-    """Say in a sentence what the new gains bring."""
+    """Say in a sentence or two what the new gains bring."""
     before, after = tuned.before, tuned.after
+    if not math.isfinite(before.worst_sensitivity):
+        was, moved = "The gains as they were are unstable. ", ""
+    else:
+        was, moved = "", f" (it was {before.step_peak_m * 1e9:.0f})"
     return (
-        f"Greatest sensitivity {before.worst_sensitivity:.2f} to {after.worst_sensitivity:.2f}, delay margin "
-        f"{before.least_delay_margin_s * 1e3:.2f} to {after.least_delay_margin_s * 1e3:.2f} ms, crossover "
-        f"{before.crossover_hz:.0f} to {after.crossover_hz:.0f} Hz; a force of {STEP_N:g} N moves the end by "
-        f"{after.step_peak_m * 1e9:.0f} nm (it was {before.step_peak_m * 1e9:.0f}). All from the identified model."
+        f"{was}Greatest sensitivity {_from(before, before.worst_sensitivity)}{after.worst_sensitivity:.2f}, delay "
+        f"margin {_from(before, before.least_delay_margin_s * 1e3)}{after.least_delay_margin_s * 1e3:.2f} ms, "
+        f"crossover {_from(before, before.crossover_hz)}{after.crossover_hz:.3g} Hz; a force of {STEP_N:g} N moves "
+        f"the end by {after.step_peak_m * 1e9:.0f} nm{moved}. All from the identified model."
     )
+
+
+def _from(before: Assessment, value: float) -> str:
+    return f"{value:.3g} to " if math.isfinite(before.worst_sensitivity) else ""
 
 
 def values_table(tuned: Tuned) -> Table:
     """Lay out the gains."""
-    rows: list[list[str | Quantity]] = [[f"control.{key}", f"{value:g}"] for key, value in tuned.values.items()]
-    return Table("Gains", ("key", "tuned"), rows)
+    rows: list[list[str | Quantity]] = [
+        [f"control.{key}", f"{tuned.old_values[key]:g}", f"{value:g}"] for key, value in tuned.values.items()
+    ]
+    return Table("Gains", ("key", "was", "tuned"), rows)
 
 
 def margins_table(tuned: Tuned) -> Table:
     """Lay out the margins before and after, at every place."""
     rows: list[list[str | Quantity]] = []
-    for name, which in (("as it was", tuned.before), ("tuned", tuned.after)):
+    for name, which in (("was", tuned.before), ("tuned", tuned.after)):
         rows += [
             [
-                f"{name}, {one.place}",
+                f"{name}: {one.place}",
                 Quantity(one.margins.sensitivity_peak_ratio, "1") if one.margins.is_stable else "unstable",
                 Quantity(one.margins.delay_margin_s, "s", prefix="m"),
                 Quantity(one.margins.crossover_hz, "Hz"),
@@ -50,9 +62,7 @@ def margins_table(tuned: Tuned) -> Table:
             ]
             for one in which.loops
         ]
-    masses = "; ".join(
-        f"{name}: {_mass(which)}" for name, which in (("as it was", tuned.before), ("tuned", tuned.after))
-    )
+    masses = "; ".join(f"{name} {_mass(which)}" for name, which in (("was", tuned.before), ("tuned", tuned.after)))
     return Table(
         "Margins",
         ("loop", "Ms", "margin", "crossover", "hold", f"{STEP_N:g} N step"),
@@ -70,10 +80,9 @@ def _rules(law: str) -> list[str]:
     if law == "pid":
         return ["PID has one number, its bandwidth; gains follow from it as `stagectl/laws/pid.py` says."]
     return [
-        "The law is fast: 8 % of the cycle rate, with eta and k twice that. It acts on a prediction, so that it adds "
-        "little noise of its own.",
-        "gamma is small: the sliding surface is damped, and its integral slow; what a steady force needs is the "
-        "observer's to know.",
-        "The filter decides: the drift that it allows an unknown force sets bandwidth and margin together, and is the "
-        "number that was searched.",
+        "The sliding surface is critically damped and a little slower than the sliding gain: eta = 0.75 k / m, "
+        "gamma = eta² / 4.",
+        "The observer reckons with more force than there is, so that it takes no margin from the law (Doyle and "
+        "Stein, 1979).",
+        "The sliding gain is the number that was searched; its margins hold up to the adaptive gain's ceiling (adapted).",
     ]

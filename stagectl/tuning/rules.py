@@ -1,9 +1,10 @@
 """Gains with a stated bandwidth and margin, from the linearised loop of the identified machine.
 
-DSMC. The law is made fast: at 8 % of the cycle rate, eta and k twice that, gamma small enough that the sliding surface
-is damped for certain. What it acts on is a prediction, so that the filter behind the prediction decides: the drift of
-its unknown force is the one number left, and sets bandwidth and margin together. It is made as large as the margins
-allow, or as the bandwidth that is asked for takes. PID has its bandwidth as that one number.
+DSMC. The sliding surface is critically damped and a little slower than the sliding gain: eta = 0.75 k / m, gamma =
+eta^2 / 4. The observer reckons with more force than there is, a walk up to a quarter of the cycle rate and white up to
+the whole of it, so that it takes no margin from the law (Doyle, Stein, IEEE TAC 24(4), 1979). What is left is one
+number, the sliding gain: it is made as large as the margins allow, the adaptive gain at its ceiling included, or as
+the bandwidth that is asked for takes. PID has its bandwidth as that one number.
 
 Every result is checked in the gap and in contact on either side, and with the moved mass 10 % off.
 """
@@ -26,11 +27,13 @@ if TYPE_CHECKING:
     from stagectl.profile import Profile
 
 PLACES = {GAP: "gap", LEFT: "left contact", RIGHT: "right contact"}
+CEILING = "gap, adapted"
+"""With the adaptive gain at its ceiling."""
 MASS_RATIO = 0.1
 
-_LAW_RATIO = 0.08  # of the cycle rate: the law's own bandwidth
-_ETA_RATIO, _SLIDING_RATIO, _GAMMA_RATIO = 2.0, 2.0, 0.02
-_SPAN = (1e-3, 1e3)  # of the profile's own number, searched
+_ETA_RATIO = 0.75
+_WALK_RATIO, _WHITE_RATIO = 0.25, 1.0  # of the cycle rate: up to where the observer reckons with forces
+_SPAN = (1e-2, 1e2)  # of the profile's own number, searched
 _GRID_COUNT = 13
 _BISECTIONS = 7
 _SLACK = 1.002  # of a limit that a search ends at
@@ -86,6 +89,7 @@ class Tuned:
 
     law: str
     values: dict[str, float]
+    old_values: dict[str, float]
     before: Assessment
     after: Assessment
 
@@ -112,7 +116,9 @@ def tuned(
         found = assessed(_with(at, key, value), law)
     _refuse(profile, law, asked, found)
     rounded = float(f"{value:.4g}")
-    return Tuned(law, fixed | {key: rounded}, before, assessed(_with(at, key, rounded), law))
+    values = fixed | {key: rounded}
+    old = {name: float(getattr(profile.control, name)) for name in values}
+    return Tuned(law, values, old, before, assessed(_with(at, key, rounded), law))
 
 
 def assessed(profile: "Profile", law: str) -> Assessment:
@@ -125,6 +131,9 @@ def assessed(profile: "Profile", law: str) -> Assessment:
             continue
         one = linearise(profile, law, body, place)
         loops.append(Loop(said, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
+    if most := most_adaptive_gain_ratio(profile, law):
+        one = linearise(profile, law, body, GAP, most)
+        loops.append(Loop(CEILING, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
     in_gap = linearise(profile, law, body)
     hold_m, peak_m = math.nan, math.nan
     if loops[0].margins.is_stable:
@@ -132,6 +141,11 @@ def assessed(profile: "Profile", law: str) -> Assessment:
         peak_m = step_peak_m(in_gap)
     stable = all(linearise(profile, law, _heavier(body, profile, ratio)).closed().is_stable() for ratio in _OFF)
     return Assessment(tuple(loops), hold_m, peak_m, stable)
+
+
+def most_adaptive_gain_ratio(profile: "Profile", law: str) -> float:
+    """Return the ceiling of the adaptive gain; 0 where a law has none."""
+    return profile.control.adaptive_gain_ceiling_ratio if law == "dsmc" else 0.0
 
 
 def step_peak_m(loop: Linearised) -> float:
@@ -156,13 +170,17 @@ def _rule(profile: "Profile", law: str) -> tuple[dict[str, float], str]:
     axis = profile.axes[-1]
     if law == "pid":
         return {}, "pid_bandwidth_hz" if profile.micro is not None else "macro_bandwidth_hz"
+    noise = profile.axis(axis).mass_kg * profile.interferometer.noise_m * math.sqrt(profile.cycle.period_s)
+    rate_per_s = 2.0 * math.pi * profile.cycle.rate_hz
     fixed = {
-        f"{axis}_bandwidth_hz": float(f"{_LAW_RATIO * profile.cycle.rate_hz:.4g}"),
         "eta_ratio": _ETA_RATIO,
-        "gamma_ratio": _GAMMA_RATIO,
-        "sliding_ratio": _SLIDING_RATIO,
+        "gamma_ratio": 0.25 * _ETA_RATIO**2,
+        "sliding_ratio": 1.0,
+        f"{axis}_drift_n_per_sqrt_s": float(f"{(_WALK_RATIO * rate_per_s) ** 3 * noise:.3g}"),
     }
-    return fixed, f"{axis}_drift_n_per_sqrt_s"
+    if axis == "micro":
+        fixed["micro_white_n_sqrt_s"] = float(f"{(_WHITE_RATIO * rate_per_s) ** 2 * noise:.3g}")
+    return fixed, f"{axis}_bandwidth_hz"
 
 
 def _with(profile: "Profile", key: str, value: float) -> "Profile":
@@ -174,8 +192,10 @@ def _searched(profile: "Profile", law: str, key: str, asked: Asked) -> float:
     now = getattr(profile.control, key)
     body = believed_body(profile)
 
+    most = most_adaptive_gain_ratio(profile, law) if asked.bandwidth_hz is None else 0.0
+
     def found(value: float) -> Margins:
-        return margins(linearise(_with(profile, key, value), law, body))
+        return margins(linearise(_with(profile, key, value), law, body, GAP, most))
 
     def keeps(value: float) -> bool:
         one = found(value)
