@@ -84,5 +84,6 @@ def _rules(law: str) -> list[str]:
         "gamma = eta² / 4.",
         "The observer reckons with more force than there is, so that it takes no margin from the law (Doyle and "
         "Stein, 1979).",
-        "The sliding gain is the number that was searched; its margins hold up to the adaptive gain's ceiling (adapted).",
+        "The sliding gain is the number that was searched; its margins hold up to the adaptive gain's ceiling "
+        "(adapted).",
     ]
