@@ -142,7 +142,11 @@ WORKED: dict[str, list[Case]] = {
     "thermal_drift": [Case((600.0, 1e-6, 600.0), 1e-6 * GONE), Case((0.0, 1e-6, 600.0), 0.0)],
     "abbe_error": [Case((0.3, 1e-5, 0.1), 4e-7), Case((-0.1, 1e-5, 0.1), 4e-7)],
     # 20 ppm over 100 s are 2 ms, at 0.2 m/s
-    "clock_skew": [Case((0.2, 100.0, 20.0), 4e-4), Case((-0.2, 0.0, 20.0), 0.0)],
+    "clock_skew": [
+        Case((0.2, 0.0, 100.0, 20.0), 4e-4),
+        Case((-0.2, 5.0, 100.0, 20.0), -3.9e-4),
+        Case((-0.2, 5.0, 0.0, 20.0), 0.0),
+    ],
     # ---- table ----
     # squares at 0, 1, ... 11 steps: half-way from 9 to 16 is 12.5; beyond the ends the outer value holds
     "force_over_position": [

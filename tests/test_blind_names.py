@@ -223,7 +223,7 @@ def test_reading_errors_are_the_same():
         error = effect.law(*(motion[q] for q in effect.quantities), *(ours[q] for q in effect.parameters))
         assert laws.reading_error(law.code, law.vector(found["parameters"]), t, x) == pytest.approx(error, rel=1e-9)
     (skew,) = translated(named("clock_skew", "macro_sensor", {"skew_ppm": -30.0}))
-    ours = CATALOGUE["clock_skew"].law(v, t, -30.0)
+    ours = CATALOGUE["clock_skew"].law(v, 0.0, t, -30.0)
     assert -skew["parameters"]["relative"] * t * v == pytest.approx(ours)  # the truth reads x(t - s T)
     for second, period_m in ((1e-9, 316.4e-9), (9e-9, 158.2e-9)):
         ours = {"first_m": 4e-9, "second_m": second, "wavelength_m": 632.8e-9}

@@ -11,7 +11,7 @@ _PHASE = (-7.0, 7.0)  # rad
 @effect(
     places=_SENSORS,
     delay_s=(-0.01, 0.01),
-    traits=(Trait.LATE_READING,),
+    traits=(Trait.LATE_READING, Trait.TIME_SHIFT),
     searched=("delay_s",),
     shown_by="acceleration",
     symptom="proportional to velocity, on the reading",
@@ -114,11 +114,13 @@ def abbe_error(position_m, bow_per_m, centre_m):
 @effect(
     places=_SENSORS,
     skew_ppm=(-1000.0, 1000.0),
-    linear=("skew_ppm",),
+    traits=(Trait.TIME_SHIFT,),
+    searched=("skew_ppm",),
     shown_by="time",
     symptom="proportional to velocity, on the reading, and growing in the course of a run",
-    reference="IEEE 1588, clause on rate offset: instants of a clock that runs fast by e are early by e t",
+    reference="IEEE 1588, clause on rate offset: instants of a clock that runs fast by e are early by e t; Taylor",
 )
-def clock_skew(velocity_m_per_s, t_s, skew_ppm):
-    """Instants of a clock of its own: the sample is taken e t later than its number says, so v e t is added."""
-    return 1e-6 * skew_ppm * velocity_m_per_s * t_s
+def clock_skew(velocity_m_per_s, acceleration_m_per_s2, t_s, skew_ppm):
+    """Instants of a clock of its own: taken T = e t later than the number says, so v T + a T^2 / 2 is added."""
+    late_s = 1e-6 * skew_ppm * t_s
+    return late_s * (velocity_m_per_s + 0.5 * acceleration_m_per_s2 * late_s)

@@ -10,7 +10,7 @@ from stagectl.gap.balance import Forces, Moved, Recording
 from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.grids import free_shapes, grids_for
-from stagectl.gap.hypotheses import DEVIATION_SD, Term
+from stagectl.gap.hypotheses import DEVIATION_SD, Term, widest_amplitudes
 from stagectl.gap.innovations import Noise
 from stagectl.gap.noise import Explained
 from stagectl.gap.normal_equations import Group, Sums, solve
@@ -32,7 +32,7 @@ class Competition:
         seed: int = 0,
         without: frozenset[str] = frozenset(),
         moved: tuple[Moved, ...] = (),
-        kept: tuple[Term, ...] = (),
+        kept: Sequence[Term] = (),
         noise: dict[str, Noise],
         crew: Crew | None = None,
     ):
@@ -78,7 +78,7 @@ class Competition:
     def _taken(self, terms: Sequence[Term], sds: Sequence[tuple[float, ...]] | None = None) -> list[Group]:
         """Take hypotheses in; without `sds` their amplitudes may be as large as their effects can be."""
         groups = []
-        priors = [_widest(term) for term in terms] if sds is None else sds
+        priors = [widest_amplitudes(term) for term in terms] if sds is None else sds
         for term, columns, prior in zip(terms, self.evidence.add_all(terms), priors, strict=True):
             self._sds += prior
             searched = 0
@@ -108,7 +108,7 @@ class Competition:
                 found.append(group)
                 continue
             term, count = outcome
-            found.append(self.evidence.append(term, next(columns), _widest(term), max(group.searched, count)))
+            found.append(self.evidence.append(term, next(columns), widest_amplitudes(term), max(group.searched, count)))
         return found
 
     def _gains_at_size(self, beside: Sequence[Group], groups: Sequence[Group]) -> list[float]:
@@ -170,13 +170,6 @@ def _periodic_terms(evidence: Evidence, prior_sds: np.ndarray) -> list[Term]:
         frequencies = seeds.frequencies_hz(recordings, axis, signals)
         found += hypotheses.periodic_terms(recordings, axis, pitches, frequencies)
     return found
-
-
-def _widest(term: Term) -> tuple[float, ...]:
-    """Return how large each amplitude can be at all: the far end of what its effect is declared for."""
-    if not term.bounds:
-        return (np.inf,) * len(term.amplitudes)
-    return tuple(max(abs(low), abs(high)) for low, high in term.bounds)
 
 
 def _energy(group: Group, s: Sums) -> float:

@@ -6,6 +6,9 @@ import numpy as np
 
 from stagectl.gap.believed import Believed, BelievedJoint
 
+CONTACT_DAMPING = "contact_damping"
+"""The effect of the library that decides about where a contact lets go."""
+
 
 @dataclass(slots=True)
 class Contact:
@@ -43,7 +46,7 @@ def contact_at(
 
 def contact_damping_n_s_per_m(believed: Believed) -> float:
     """Return the damping that the joint is believed to have in contact only."""
-    return sum(row["damping_n_s_per_m"] for row in believed.effects if row["name"] == "contact_damping")
+    return sum(row["damping_n_s_per_m"] for row in believed.effects if row["name"] == CONTACT_DAMPING)
 
 
 def side_stiffness_n_per_m(joint: BelievedJoint, side: np.ndarray) -> np.ndarray:

@@ -59,6 +59,7 @@ def grids_for(recordings: Sequence[Recording]) -> Grid:
         ],
         "sensor_delay": [{"delay_s": t} for t in (1e-5, 3e-4)],
         "sensor_lag": [{"time_constant_s": t} for t in (5e-5, 3e-4)],
+        "clock_skew": [{"skew_ppm": 10.0}],
         "cyclic_error": [
             {"wavelength_m": _LASER_M, "second_m": 0.0, "second_phase_rad": 0.0},
             {"wavelength_m": _LASER_M, "first_m": 0.0, "first_phase_rad": 0.0},

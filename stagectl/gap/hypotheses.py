@@ -35,6 +35,13 @@ class Term:
         return self.name, self.acts_on
 
 
+def widest_amplitudes(term: Term) -> tuple[float, ...]:
+    """Return how large each amplitude can be at all: the far end of what its effect is declared for."""
+    if not term.bounds:
+        return (np.inf,) * len(term.amplitudes)
+    return tuple(max(abs(low), abs(high)) for low, high in term.bounds)
+
+
 def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
     """Errors of what is believed, as terms with the standard deviation of their amplitude (a ratio, or metres)."""
     believed = recording.believed

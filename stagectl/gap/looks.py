@@ -17,7 +17,7 @@ from stagectl.gap.left_over import excess, unknown_rest
 from stagectl.gap.naming import all_named
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group
-from stagectl.gap.settling import moved_by, moves_joint, remeasured, settled, stands
+from stagectl.gap.settling import moved_by, moves_joint, moves_readings, remeasured, settled, stands
 
 _CLOSER_LOOKS = 2
 _FORETOLD_PASSES = 3  # a friction is known along a motion that knows of the friction
@@ -74,11 +74,17 @@ def _under(
     crew: Crew,
 ) -> Competition:
     """Make the competition along the motion that `known` effects make, at the place where they put the joint."""
-    moving = [group for group in known if moves_joint(first, group)]
+    moving = [group for group in known if moves_readings(first, group)]
     still = [group for group in known if group not in moving]
     explained = first.explained(still)
     first.evidence.forget_trials()
-    there, moved = settled(unsettled, noise, tuple(moved_by(first, known, group) for group in moving), crew)
+    there, moved, kept = settled(
+        unsettled,
+        noise,
+        tuple(moved_by(first, known, group) for group in moving),
+        tuple(first.term(group) for group in still),
+        crew,
+    )
     for _ in range(_FORETOLD_PASSES if still else 1):
         there = crew.here(
             lambda r: balance.foretold_under(r, balance.sum_of(balance.known_forces(r), explained(r))), there
@@ -88,7 +94,7 @@ def _under(
         first.judge.training_count,
         without=without,
         moved=moved,
-        kept=tuple(first.term(group) for group in still),
+        kept=kept,
         noise=noise_of(there, explained),
         crew=crew,
     )

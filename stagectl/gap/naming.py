@@ -9,6 +9,7 @@ from stagectl.gap.competition import Competition
 from stagectl.gap.findings import Named, ParameterError
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Solution, solve
+from stagectl.gap.settling import settled_by
 
 
 def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
@@ -166,11 +167,10 @@ def refitted_errors(
             for name in hypotheses.parts_of(term.name):
                 groups[name].append(group)
     found = {name: solution.total_of(summed) for name, summed in groups.items()}
-    settled = search.evidence.recordings[0].believed.joint
-    if believed.joint is not None and settled is not None and not search.moved:
-        for name in ("left_m", "right_m"):
+    if not search.moved:
+        for name, change in settled_by(believed, search.evidence.recordings[0]).items():
             value, sd = found[name]
-            found[name] = value + getattr(settled, name) - getattr(believed.joint, name), sd
+            found[name] = value + change, sd
     for wrong in widths:
         for name in hypotheses.parts_of(wrong.name):
             value, sd = found[name]

@@ -91,7 +91,7 @@ def _found(
     unsettled = crew.here(lambda log: balance.recording_of(log, believed), logs)
     plausibility.check_recordings(believed, unsettled)
     noise = noise_of(unsettled)
-    recordings, _ = settled(unsettled, noise, crew=crew)
+    recordings, *_ = settled(unsettled, noise, crew=crew)
     first = Competition(
         recordings, len(training), nulls_count=nulls_count, seed=seed, without=without, noise=noise, crew=crew
     )
