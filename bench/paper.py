@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from bench import ablation, learning, limits
 from bench.figure import Bar, Figure, judged
 from stagectl.paper import gated, identification_test, recursive_least_squares, rig_chapter
 from stagectl.paper.chapters import CHAPTERS, work_through
@@ -60,6 +61,8 @@ def figures(*, full: bool, say: Say) -> Iterator[Figure]:
     yield from _table_2(samples)
     yield from _rig()
     yield from _costs(samples)
+    for part in (limits, ablation, learning):
+        yield from part.figures(full=full, say=say)
     for chapter in work_through(tuple(CHAPTERS), lambda what, _: say(what)):
         yield from figures_of(chapter)
 

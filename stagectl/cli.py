@@ -156,7 +156,26 @@ SectionArgument = Annotated[
 ]
 PaperFolder = Annotated[Path, _option("Folder of the page.", "--out", metavar="FOLDER")]
 
+BudgetRun = Annotated[
+    str | None,
+    typer.Argument(
+        help="A run to hold the prediction against: its folder, its name, or 'latest' (default: the profile's machine, "
+        "simulated).",
+        metavar="[RUN]",
+    ),
+]
+
+TuneProfile = Annotated[Path | None, _option("Profile to write.", "--out", "-o", metavar="NEW_PROFILE")]
+TunePage = Annotated[Path, _option("Folder of the page.", "--page", metavar="FOLDER")]
+TuneBandwidth = Annotated[
+    float | None,
+    _option("Crossover of the loop (default: as much as the margins allow).", "--bandwidth-hz", min=0.1, max=5000.0),
+]
+TuneSensitivity = Annotated[float, _option("Greatest sensitivity Ms allowed.", "--max-sensitivity", min=1.05, max=10.0)]
+TuneDelay = Annotated[float, _option("Least delay margin, s.", "--delay-margin-s", min=0.0, max=0.01)]
+
 _PROFILE, _RUNS, _GAP, _PAPER = "oled-printer", Path("runs"), Path("gap"), Path("paper")
+_BUDGET, _TUNE = Path("budget"), Path("tune")
 
 
 def _version(wanted: bool) -> None:
@@ -335,6 +354,45 @@ def replay(run: RunArgument, runs: Runs = _RUNS, json: Json = False) -> None:
 def reproduce(section: SectionArgument = None, out: PaperFolder = _PAPER, json: Json = False) -> None:
     """Run the paper that the control law comes from, as printed and as corrected, beside its own numbers."""
     _deliver("reproduce", json, lambda voice: commands.reproduce.show(voice, section, out))
+
+
+@app.command(epilog=_epilog("stagectl budget oled-printer", "stagectl budget my-stage.toml latest --json"))
+def budget(
+    profile: ProfileArgument = _PROFILE,
+    run: BudgetRun = None,
+    law: Law = None,
+    seed: Seed = 1,
+    runs: Runs = _RUNS,
+    out: PaperFolder = _BUDGET,
+    json: Json = False,
+) -> None:
+    """Say what the end's error is made of, predicted beside measured, how little is possible, what to improve next."""
+    _deliver("budget", json, lambda voice: commands.budget.show(voice, profile, run, law, seed, runs, out))
+
+
+@app.command(
+    epilog=_epilog("stagectl tune oled-printer", "stagectl tune my-stage.toml --bandwidth-hz 40 -o my-stage-2.toml")
+)
+def tune(
+    profile: ProfileArgument = _PROFILE,
+    law: Law = None,
+    bandwidth_hz: TuneBandwidth = None,
+    max_sensitivity: TuneSensitivity = 2.0,
+    delay_margin_s: TuneDelay = 0.8e-3,
+    out: TuneProfile = None,
+    force: Force = False,
+    page: TunePage = _TUNE,
+    json: Json = False,
+) -> None:
+    """Find gains with a stated bandwidth and margin from the identified model; -o writes a new profile with them."""
+
+    def work(voice: "Voice") -> "Answer":
+        from stagectl.tuning.rules import Asked
+
+        asked = Asked(max_sensitivity, delay_margin_s, bandwidth_hz)
+        return commands.tune.show(voice, profile, law, asked, out, force, page)
+
+    _deliver("tune", json, work)
 
 
 @profile_app.command("check", epilog=_epilog("stagectl profile check my-stage.toml"))

@@ -287,6 +287,7 @@ class Control(Table):
     park_error_m: Annotated[float, above(0.0, 1.0)] = 100e-6
     pid_bandwidth_hz: Bandwidth = 50.0
     macro_damping_ratio: Annotated[float, within(0.1, 5.0)] = 0.8
+    macro_feed_forward_ratio: Annotated[float, within(0.0, 1.0)] = 1.0
     eta_ratio: Annotated[float, within(0.0, 100.0)] = 1.0
     gamma_ratio: Annotated[float, within(0.0, 100.0)] = 0.1
     sliding_ratio: Annotated[float, within(0.0, 100.0)] = 1.0
@@ -297,6 +298,7 @@ class Control(Table):
     adaptive_gain_ceiling_ratio: Annotated[float, within(0.0, 10.0)] = 0.5
     macro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 5.0
     micro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 0.2
+    micro_white_n_sqrt_s: Annotated[float, within(0.0, 1e5)] = 0.0
 
     @model_validator(mode="after")
     def _check_law(self) -> "Control":

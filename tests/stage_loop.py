@@ -34,9 +34,19 @@ class Loop:
         self._advance(d["sample"] * d["period_s"])
 
     def cycle(
-        self, setpoint, *, fresh: bool = True, silent: bool = False, lost: bool = False, **measured: float
+        self,
+        setpoint,
+        *,
+        fresh: bool = True,
+        silent: bool = False,
+        lost: bool = False,
+        added_micro_n: float = 0.0,
+        **measured: float,
     ) -> None:
-        """Run one cycle. Not fresh: its line comes a cycle late; silent: never. `measured` overwrites what is seen."""
+        """Run one cycle. Not fresh: its line comes a cycle late; silent: never. `measured` overwrites what is seen.
+
+        `added_micro_n` is put on the micro's command behind the controller, which does not know of it.
+        """
         one = self.simulation
         d, m, c = one.devices[0], one.controller.measurement, one.controller.command
         t_s = d["sample"] * d["period_s"]
@@ -76,5 +86,6 @@ class Loop:
         if not lost:
             d["macro_a"] = c["macro_word"][0] * d["macro_amperes_per_word"]
             d["micro_a"] = c["micro_word"][0] * d["micro_amperes_per_word"]
+            d["micro_a"] += added_micro_n / one.controller.belief["micro_force_constant_n_per_a"][0]
         d["sample"] += 1.0
         self._advance(d["sample"] * d["period_s"])

@@ -25,20 +25,42 @@ def standing(profile, machine, law: str, cycles: int = 50, **values) -> Loop:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_words_are_the_nearest_integers_of_what_was_asked(oled_profile, oled_machine, law):
-    """0.1 % of 500 N and of 60 N a step; the force that is believed is that of the integer."""
+    """0.1 % of 500 N and of 60 N a step; the force that is believed is that of the integer.
+
+    What rounding leaves over goes into the next word: after any number of cycles at most half a step is owed.
+    """
     loop = Loop(simulated(oled_profile, oled_machine, law))
     signs = set()
+    owed_n = {"macro": 0.0, "micro": 0.0}
     for setpoint in trajectory.trapezoid(0.05, 0.2, dwell_s=0.1, lead_s=0.1).setpoints:
         loop.cycle(setpoint)
         c = loop.simulation.controller.command[0]
         for axis, step_n in (("macro", 0.5), ("micro", 0.06)):
             word, asked_n = int(c[f"{axis}_word"]), float(c[f"{axis}_force_asked_n"])
             assert c[f"{axis}_force_n"] == pytest.approx(word * step_n, rel=1e-12)
-            assert abs(word * step_n - asked_n) <= 0.5 * step_n * (1.0 + 1e-9)
+            owed_n[axis] += asked_n - word * step_n
+            # what is asked counts in sixteenths of a step: a few of the rounding to them, each 1/32 at most, add up
+            assert abs(owed_n[axis]) <= (0.5 + 50 / 32) * step_n
             signs.add((axis, np.sign(word)))
+        owed = {axis: loop.simulation.controller.estimator[f"{axis}_carried_word"][0] for axis in owed_n}
+        assert max(map(abs, owed.values())) <= 0.5
         assert loop.simulation.controller.estimator["micro_word"][0] == c["micro_word"]
         assert loop.simulation.controller.estimator["macro_word"][0] == c["macro_word"]
     assert {("macro", 1.0), ("macro", -1.0), ("micro", 1.0), ("micro", -1.0)} <= signs
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_what_is_owed_carries_no_word_beyond_the_limit(oled_profile, oled_machine, law):
+    """At its limit of 180 N the micro is sent 3000 words, whatever rounding has left over before."""
+    loop = Loop(simulated(oled_profile, oled_machine, law))
+    hold = np.zeros(1, SETPOINT)
+    for _ in range(20):
+        loop.cycle(hold[0])
+    loop.simulation.controller.estimator["micro_carried_word"] = 0.5
+    hold["acceleration_m_per_s2"] = 10.0
+    loop.cycle(hold[0])
+    assert loop.simulation.controller.command["micro_force_asked_n"][0] == 180.0
+    assert loop.simulation.controller.command["micro_word"][0] == 3000
 
 
 @pytest.mark.parametrize("law", LAWS)

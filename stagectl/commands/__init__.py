@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from stagectl.commands import (
+        budget,
         demo,
         gap,
         gap_demo,
@@ -21,9 +22,11 @@ if TYPE_CHECKING:
         reproduce,
         runs,
         serve,
+        tune,
     )
 
 __all__ = [
+    "budget",
     "demo",
     "gap",
     "gap_demo",
@@ -36,6 +39,7 @@ __all__ = [
     "reproduce",
     "runs",
     "serve",
+    "tune",
 ]
 
 

@@ -11,9 +11,9 @@ from rich.table import Table
 
 from stagectl import toml_file
 from stagectl.commands.answer import Answer, Voice
-from stagectl.commands.profiles import check_eds
+from stagectl.commands.new_profile import refuse_place, text_of, write_checked
 from stagectl.commands.runs import folder_of
-from stagectl.errors import ProfileError, RequestError
+from stagectl.errors import RequestError
 from stagectl.gap import addition, arbiter, findings_page, residual
 from stagectl.gap.application import Application, Change, application
 from stagectl.gap.believed import Believed, document_of, load_believed
@@ -22,8 +22,7 @@ from stagectl.gap.findings import Findings, Named
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import Log, read_log
 from stagectl.gap.workflow import find
-from stagectl.profile import Profile, search_folders
-from stagectl.whole_file import replace_whole
+from stagectl.profile import search_folders
 
 PAGE = "findings.html"
 
@@ -75,45 +74,16 @@ def search(
 def apply(voice: Voice, profile: str, findings: Path, out: Path, candidates: bool, force: bool) -> Answer:
     """Write a new profile: the old one's text with the findings in it; the old one is never touched."""
     path = toml_file.find(profile, search_folders(), "profile")
-    _refuse_place(path, out, force)
-    try:
-        old = path.read_bytes().decode()
-    except OSError as error:
-        raise ProfileError(f"{path}: can't be read ({error.strerror}); check path and permissions") from error
-    except UnicodeDecodeError as error:
-        raise ProfileError(f"{path}: is not UTF-8 text ({error}); save it as UTF-8") from error
+    refuse_place(path, out, force)
+    old = text_of(path)
     document_of(old.encode(), path)  # the old one is right by itself, and its own effects are known from here on
     file = findings / FINDINGS if findings.is_dir() else findings
     done = application(old, read_findings(file), candidates=candidates, date=date.today().isoformat())
-    content = done.text.encode()
-    try:
-        document = document_of(content, out)
-        if isinstance(document, Profile):
-            check_eds(document)
-    except ProfileError as error:
-        raise ProfileError(
-            f"the profile with these findings fails its check, {out} is not written:\n{error}"
-        ) from error
-    try:
-        replace_whole(out, content)
-    except OSError as error:
-        raise RequestError(f"-o {out}: can't be written: {error.strerror}; give another file") from error
+    write_checked(done.text, out, "findings")
     for reason in done.left:
         voice.warn(f"not written: {reason}")
     data = {"profile": out, "changes": [asdict(change) for change in done.changes], "left": list(done.left)}
     return Answer(data, [_changes_table(done), f"Profile: {out}"])
-
-
-def _refuse_place(path: Path, out: Path, force: bool) -> None:
-    """Refuse to write over the old profile at all, and over another file without a word."""
-    if out.exists() and path.exists() and out.samefile(path):
-        raise RequestError(f"-o {out} is the profile itself, which is never changed; give another file")
-    if out.is_dir():
-        raise RequestError(f"-o {out} is a folder; give the file to write")
-    if not out.parent.is_dir():
-        raise RequestError(f"-o {out}: there is no folder {out.parent}; make it, or give another file")
-    if out.exists() and not force:
-        raise RequestError(f"-o {out} is there already; give another file, or --force to replace it")
 
 
 def _changes_table(done: Application) -> Table:

@@ -19,7 +19,7 @@ import numpy as np
 
 from stagectl import plant
 from stagectl.compiled import compiled
-from stagectl.laws.reference import between, gap_centre
+from stagectl.laws.reference import between, felt_after_s, gap_centre, precise_current_loop_s
 from stagectl.signals import Record
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ LAW = np.dtype(
         ("macro_damping_per_s", "f8"),
         ("precision_force_limit_n", "f8"),
         ("macro_force_limit_n", "f8"),
+        ("macro_feed_forward_ratio", "f8"),  # of the reference's acceleration
         ("park_error_m", "f8"),
         ("park_stiffness_per_s2", "f8"),
         ("park_damping_per_s", "f8"),
@@ -54,6 +55,9 @@ LAW = np.dtype(
         ("started", "f8"),
     ]
 )
+
+LINEAR_STATES = ("error_integral_m_s",)
+"""What a cycle leaves to the next about e = 0; the adaptive gain counts there as a parameter (s = 0)."""
 
 _PARK_BANDWIDTH_HZ = 15.0
 _BUMP_S = 0.02
@@ -81,6 +85,7 @@ def init(profile: "Profile") -> np.ndarray:
     precise = profile.micro if profile.micro is not None else profile.macro
     law["precision_force_limit_n"] = precise.force_limit_n
     law["macro_force_limit_n"] = profile.macro.force_limit_n
+    law["macro_feed_forward_ratio"] = control.macro_feed_forward_ratio
     law["park_error_m"] = control.park_error_m
     w = 2.0 * np.pi * _PARK_BANDWIDTH_HZ
     law["park_stiffness_per_s2"] = w * w
@@ -101,8 +106,9 @@ def integrand(e: float, phi: float) -> float:
 
 @compiled
 def middle(after: Record, later: Record, q: Record, law: Record, dt_s: float) -> None:
-    """Take known forces at the predicted motion, half a period after the command begins to act."""
-    plant.half_step(after, q, dt_s, 0.0, 0.0, plant.BRIDGE_CURRENT, plant.BRIDGE_CURRENT)
+    """Take known forces at the predicted motion when the command is felt: in the middle of its period, and the lag."""
+    twice_s = 2.0 * felt_after_s(precise_current_loop_s(q), dt_s)
+    plant.half_step(after, q, twice_s, 0.0, 0.0, plant.BRIDGE_CURRENT, plant.BRIDGE_CURRENT)
 
 
 @compiled
@@ -123,7 +129,8 @@ def precision(
 ) -> float:
     """Return the force of the axis that carries the end, N, within what its motor makes at its limits."""
     known_n += disturbance_n
-    acceleration = later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3
+    felt_s = felt_after_s(precise_current_loop_s(q), dt_s)
+    acceleration = later.acceleration_m_per_s2 + felt_s * later.jerk_m_per_s3
     e = ahead.end_position_m - later.position_m
     de = ahead.end_velocity_m_per_s - later.velocity_m_per_s
     law.error_m = e
@@ -184,6 +191,8 @@ def carrier(
     known_n += disturbance_n
     e = ahead.macro_position_m - (later.position_m - later.relative_position_m + gap_centre(q))
     de = ahead.macro_velocity_m_per_s - (later.velocity_m_per_s - later.relative_velocity_m_per_s)
-    acceleration = later.acceleration_m_per_s2 + 0.5 * dt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
+    felt_s = felt_after_s(q.macro_current_loop_s, dt_s)
+    acceleration = later.acceleration_m_per_s2 + felt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
+    acceleration *= law.macro_feed_forward_ratio
     wanted = acceleration - law.macro_stiffness_per_s2 * e - law.macro_damping_per_s * de
     return between(mass_kg * wanted - known_n, low_n, high_n)

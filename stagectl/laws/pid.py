@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stagectl.compiled import compiled
-from stagectl.laws.reference import between, gap_centre
+from stagectl.laws.reference import between, felt_after_s, gap_centre, precise_current_loop_s
 from stagectl.signals import Record
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ LAW = np.dtype(
         ("filter_ratio", "f8"),
         ("precision_force_limit_n", "f8"),
         ("macro_force_limit_n", "f8"),
+        ("macro_feed_forward_ratio", "f8"),  # of the reference's acceleration
         ("precision_integral_m", "f8"),
         ("macro_integral_m", "f8"),
         ("precision_error_m", "f8"),
@@ -45,6 +46,11 @@ LAW = np.dtype(
         ("parked", "f8"),
     ]
 )
+
+LINEAR_STATES = tuple(
+    f"{axis}_{name}" for axis in ("precision", "macro") for name in ("integral_m", "error_m", "error_rate_m_per_s")
+)
+"""What a cycle leaves to the next about e = 0."""
 
 _POSITION_RATIO = 0.25
 _INTEGRAL_RATIO = 0.1
@@ -66,6 +72,7 @@ def init(profile: "Profile") -> np.ndarray:
     precise = profile.micro if profile.micro is not None else profile.macro
     law["precision_force_limit_n"] = precise.force_limit_n
     law["macro_force_limit_n"] = profile.macro.force_limit_n
+    law["macro_feed_forward_ratio"] = control.macro_feed_forward_ratio
     return law
 
 
@@ -111,7 +118,7 @@ def precision(
     velocity_error = law.precision_error_rate_m_per_s + law.precision_position_per_s * error
     wanted = (
         later.acceleration_m_per_s2
-        + 0.5 * dt_s * later.jerk_m_per_s3
+        + felt_after_s(precise_current_loop_s(q), dt_s) * later.jerk_m_per_s3
         + law.precision_velocity_per_s * velocity_error
         + law.precision_integral_per_s2 * law.precision_integral_m
     )
@@ -147,10 +154,10 @@ def carrier(
     law.macro_error_rate_m_per_s += law.filter_ratio * (rate - law.macro_error_rate_m_per_s)
     law.macro_error_m = error
     velocity_error = law.macro_error_rate_m_per_s + law.macro_position_per_s * error
+    felt_s = felt_after_s(q.macro_current_loop_s, dt_s)
+    acceleration = later.acceleration_m_per_s2 + felt_s * later.jerk_m_per_s3 - later.relative_acceleration_m_per_s2
     wanted = (
-        later.acceleration_m_per_s2
-        + 0.5 * dt_s * later.jerk_m_per_s3
-        - later.relative_acceleration_m_per_s2
+        law.macro_feed_forward_ratio * acceleration
         + law.macro_velocity_per_s * velocity_error
         + law.macro_integral_per_s2 * law.macro_integral_m
     )

@@ -1,0 +1,181 @@
+"""What each part of DSMC buys: each is switched off once, on the same seeds, the same machine, the same motions.
+
+Parts are switched off in the controller's states, never in its code, so that nothing else differs.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.figure import Bar, Figure, absent, judged
+from bench.scans import controller_of, scan, true_error_m
+from sim_backend.machine import Machine, load_machine
+from stagectl import trajectory
+from stagectl.batch import simulation
+from stagectl.effects import CATALOGUE
+from stagectl.errors import RequestError
+from stagectl.laws.reference import gap_centre
+from stagectl.profile import Profile, load_profile
+from stagectl.tick import Controller
+from tests.stage_loop import Loop
+
+ABOUT = "Each part of the law switched off once; see `bench/ablation.py`."
+
+_SEEDS = (1, 2, 3, 4, 5)
+_SETTLED_S = 0.3
+_WEAK = {"macro_bandwidth_hz": 6.0, "macro_feed_forward_ratio": 0.0}  # so that the joint touches on both sides
+_AT_ONCE_S = 1e-6
+_NO_STIFFNESS = 1e-9  # N/m
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One part of the law and how it is switched off; `asked_fed`: observer and rounding are fed what was asked."""
+
+    name: str
+    off: Callable[[Controller, Profile], None]
+    asked_fed: bool = False
+
+
+def _nothing(controller: Controller, profile: Profile) -> None:
+    pass
+
+
+def _no_contact(controller: Controller, profile: Profile) -> None:
+    """Believe in a joint that pushes with nothing; its centre stays known."""
+    controller.belief["left_stiffness_n_per_m"] = controller.belief["right_stiffness_n_per_m"] = _NO_STIFFNESS
+    place = 0
+    for row in profile.effects:
+        count = len(CATALOGUE[row["name"]].parameters)
+        if row["acts_on"] == "contact":
+            controller.effects[place : place + count] = 0.0
+        place += count
+
+
+def _no_delay(controller: Controller, profile: Profile) -> None:
+    controller.estimator["actuation_delay_s"] = _AT_ONCE_S
+
+
+def _no_unknown_force(controller: Controller, profile: Profile) -> None:
+    controller.estimator["micro_force_gain_n_per_m"] = 0.0
+
+
+def _no_sliding(controller: Controller, profile: Profile) -> None:
+    """Leave the surface alone to bring the error back: what was k s is no more."""
+    controller.law["sliding_gain_per_s"] = 0.0
+
+
+def _no_integral(controller: Controller, profile: Profile) -> None:
+    """Take z out of the surface: a linear law on e and e' with the same k and eta."""
+    controller.law["gamma_per_s2"] = 0.0
+
+
+def _no_adaptation(controller: Controller, profile: Profile) -> None:
+    controller.law["adaptation_per_s"] = 0.0
+
+
+PARTS = (
+    Part("whole", _nothing),
+    Part("no contact prediction", _no_contact),
+    Part("asked force fed, not the integer sent", _nothing, asked_fed=True),
+    Part("no delay compensation", _no_delay),
+    Part("no unknown force", _no_unknown_force),
+    Part("no sliding part (k = 0)", _no_sliding),
+    Part("no integral in the surface", _no_integral),
+    Part("no adaptation", _no_adaptation),
+)
+"""The first is the law as it is; the others lack one part each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one part's absence leaves, worst of the seeds, m; nan where the guard ended it, for `reason`."""
+
+    hold_m: float
+    peak_m: float
+    contact_peak_m: float
+    reason: str = ""
+
+
+def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
+    """Measure every part's absence."""
+    profile, machine = load_profile("oled-printer"), load_machine("oled-printer")
+    seeds = tuple(range(1, 21)) if full else _SEEDS
+    for part in PARTS:
+        say(f"ablation: {part.name}")
+        found = measured(part, profile, machine, seeds)
+        rows = (("hold", found.hold_m), ("peak, contact-free", found.peak_m), ("peak, contact", found.contact_peak_m))
+        for what, value_m in rows:
+            bar = Bar(f"ablation, {part.name}: {what}", "nm")
+            if np.isnan(value_m):
+                yield absent(bar, found.reason)
+            else:
+                yield judged(bar, value_m * 1e9, list(seeds))
+
+
+def measured(part: Part, profile: Profile, machine: Machine, seeds: tuple[int, ...]) -> Outcome:
+    """Follow the 0.8 m trapezoid with a good macro and with a weak one that lets the joint touch."""
+    weak = profile.model_copy(update={"control": profile.control.model_copy(update=_WEAK)})
+    planned = trajectory.trapezoid(0.8, 0.2, dwell_s=1.5, start_m=-0.4, lead_s=0.5, dt_s=profile.cycle.period_s)
+    values = {}
+    reasons = []
+    for name, of in (("good", profile), ("weak", weak)):
+        try:
+            values[name] = [_errors(part, of, machine, planned.setpoints, seed) for seed in seeds]
+        except RequestError as error:
+            values[name] = []
+            reasons.append(str(error))
+    hold_m, peak_m = _worst(values["good"], planned.setpoints, profile.cycle.rate_hz)
+    _, contact_peak_m = _worst(values["weak"], planned.setpoints, profile.cycle.rate_hz)
+    return Outcome(hold_m, peak_m, contact_peak_m, "; ".join(reasons))
+
+
+def _worst(errors: list[np.ndarray], setpoints: np.ndarray, rate_hz: float) -> tuple[float, float]:
+    """Return the greatest rms in rest, and the greatest error at all."""
+    if not errors:
+        return float("nan"), float("nan")
+    moving = np.flatnonzero(setpoints["velocity_m_per_s"] != 0.0)
+    index = np.arange(setpoints.size)
+    before = np.searchsorted(moving, index, side="right") - 1
+    rest = (before >= 0) & (index - moving[np.maximum(before, 0)] >= _SETTLED_S * rate_hz)
+    return (
+        max(float(np.sqrt(np.mean(error[rest] ** 2))) for error in errors),
+        max(float(np.max(np.abs(error))) for error in errors),
+    )
+
+
+def _errors(part: Part, profile: Profile, machine: Machine, setpoints: np.ndarray, seed: int) -> np.ndarray:
+    controller = controller_of(profile, "dsmc")
+    part.off(controller, profile)
+    if part.asked_fed:
+        return _with_asked_fed(controller, profile, machine, setpoints, seed)
+    return true_error_m(scan(controller, profile, machine, setpoints, seed), setpoints)
+
+
+def _with_asked_fed(
+    controller: Controller, profile: Profile, machine: Machine, setpoints: np.ndarray, seed: int
+) -> np.ndarray:
+    """Follow in Python, where the observer's words can be changed behind every cycle: error at the samples."""
+    one = simulation(controller, machine, latch_delay_s=profile.cycle.actuation_delay_s, seed=seed)
+    start_m = float(setpoints["position_m"][0])
+    one.state["end_position_m"] = start_m
+    one.state["macro_position_m"] = start_m + float(gap_centre(controller.belief[0]))
+    steps_n = {
+        axis: float(controller.estimator[f"{axis}_amperes_per_word"][0])
+        * float(controller.belief[f"{axis}_force_constant_n_per_a"][0])
+        for axis in ("macro", "micro")
+    }
+    loop = Loop(one)
+    rest = np.zeros(round(profile.cycle.rate_hz), setpoints.dtype)
+    rest["position_m"] = start_m
+    error_m = []
+    for setpoint in np.concatenate([rest, setpoints]):
+        loop.cycle(setpoint)
+        if loop.stop:
+            raise RequestError(f"machine {machine.name}, seed {seed}: stop {loop.stop}")
+        for axis, step_n in steps_n.items():
+            controller.estimator[f"{axis}_word"] = controller.command[f"{axis}_force_asked_n"] / step_n
+            controller.estimator[f"{axis}_carried_word"] = 0.0
+        error_m.append(loop.true_end_m - setpoint["position_m"])
+    return np.array(error_m[rest.size :])

@@ -1,0 +1,44 @@
+"""How little is possible, computed, and whether the error budget's sum is what is measured."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from bench.figure import Bar, Figure, judged
+from sim_backend.machine import load_machine
+from stagectl.budget import budget, lqg
+from stagectl.budget.lqg import Surroundings
+from stagectl.profile import load_profile
+
+HOLD = Bar("bound: hold at one cycle of delay, 5 nm, 5 mN", "nm")
+DRIFTING = Bar("bound: the same with a force that drifts by 16 mN/sqrt(s)", "nm")
+DELAY = "bound: peak for a step of 0.1 N at Ms 2, {cycles:g} cycles of delay"
+SUM = Bar("budget: sum of the sources off from the measured hold, worst seed, {law}", "%", 15.0)
+OVER = Bar("budget: hold of dsmc over the optimum at Ms 2.0", "1")
+LEAST = Bar("budget: optimum at Ms 2.0 for the profile's sensor, delay and torque step", "nm")
+
+_PROTOTYPE = {0.4: 16, 0.6: 22, 1.0: 35, 1.5: 56, 2.0: 81}  # nm, of a search over two gains
+_SEEDS = (1, 2, 3)
+_REALISTIC = Surroundings(40.0, 1e-3, 1e-3, 5e-9, 5e-3)
+
+
+def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
+    """Compute the bounds, then hold budgets against simulated machines."""
+    say("bounds")
+    drifting = replace(_REALISTIC, force_drift_n_per_sqrt_s=16e-3)
+    yield judged(HOLD, 1e9 * lqg.bound(_REALISTIC).true_rms_m, reason="a throw-away computation had 2.9 nm")
+    yield judged(DRIFTING, 1e9 * lqg.bound(drifting).true_rms_m, reason="a throw-away computation had 3.6 nm")
+    for cycles, had_nm in _PROTOTYPE.items():
+        loop = lqg.stiffest(replace(drifting, delay_s=cycles * drifting.period_s))
+        said = f"crossover {loop.robustness().crossover_hz:.0f} Hz; a search over two gains had {had_nm} nm"
+        yield judged(Bar(DELAY.format(cycles=cycles), "nm"), 1e9 * loop.step_peak_m(0.1), reason=said)
+    profile, machine = load_profile("oled-printer"), load_machine("oled-printer")
+    for law in ("dsmc", "pid"):
+        say(f"budget under {law}")
+        found = [budget.of_machine(profile, law, machine, seed) for seed in (range(1, 11) if full else _SEEDS)]
+        worst = max(100.0 * abs(one.parts[0].ratio - 1.0) for one in found)
+        yield judged(replace(SUM, figure=SUM.figure.format(law=law)), worst, list(_SEEDS))
+        if law == "dsmc":
+            least = found[0].bounds.robust
+            said = f"Ms {least.robustness.max_sensitivity:.2f}; the law's {found[0].margins.sensitivity_peak_ratio:.2f}"
+            yield judged(LEAST, 1e9 * least.true_rms_m, reason=said)
+            yield judged(OVER, found[0].hold_m / least.true_rms_m)

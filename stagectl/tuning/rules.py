@@ -1,0 +1,269 @@
+"""Gains with a stated bandwidth and margin, from the linearised loop of the identified machine.
+
+DSMC. The sliding surface is critically damped and a little slower than the sliding gain: eta = 0.75 k / m, gamma =
+eta^2 / 4. The observer reckons with more force than there is, a walk up to a quarter of the cycle rate and white up to
+the whole of it, so that it takes no margin from the law (Doyle, Stein, IEEE TAC 24(4), 1979). What is left is one
+number, the sliding gain: it is made as large as the margins allow, the adaptive gain at its ceiling included, or as
+the bandwidth that is asked for takes. PID has its bandwidth as that one number.
+
+Every result is checked in the gap and in contact on either side, and with the moved mass 10 % off.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stagectl.budget import shares
+from stagectl.budget.budget import STEP_N
+from stagectl.budget.disturbances import noises_of
+from stagectl.errors import RequestError
+from stagectl.linear_loop import GAP, LEFT, RIGHT, Body, Linearised, believed_body, linearise
+from stagectl.margins import Margins, grid_hz, margins
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
+
+PLACES = {GAP: "gap", LEFT: "left contact", RIGHT: "right contact"}
+CEILING = "gap, adapted"
+"""With the adaptive gain at its ceiling."""
+MASS_RATIO = 0.1
+
+_ETA_RATIO = 0.75
+_WALK_RATIO, _WHITE_RATIO = 0.25, 1.0  # of the cycle rate: up to where the observer reckons with forces
+_SPAN = (1e-2, 1e2)  # of the profile's own number, searched
+_GRID_COUNT = 13
+_BISECTIONS = 7
+_SLACK = 1.002  # of a limit that a search ends at
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What gains have to keep; `bandwidth_hz` None = as much as the margins allow."""
+
+    max_sensitivity: float = 2.0
+    delay_margin_s: float = 0.8e-3
+    bandwidth_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loop:
+    """What one profile's loop shows at one place; gains complex, shapes (n,)."""
+
+    place: str
+    margins: Margins
+    frequency_hz: np.ndarray
+    loop_gain: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assessment:
+    """A profile's gains, judged: loops at every place, hold and answer to a step of force in the gap."""
+
+    loops: tuple[Loop, ...]
+    hold_m: float  # with the sensor's noise and torque step of the profile; nan where unstable
+    step_peak_m: float
+    stable_with_other_mass: bool
+
+    @property
+    def worst_sensitivity(self) -> float:
+        """Greatest sensitivity of all places; infinite where one is unstable."""
+        return max(one.margins.sensitivity_peak_ratio if one.margins.is_stable else math.inf for one in self.loops)
+
+    @property
+    def least_delay_margin_s(self) -> float:
+        """Least delay margin of all places."""
+        return min(one.margins.delay_margin_s for one in self.loops)
+
+    @property
+    def crossover_hz(self) -> float:
+        """Crossover in the gap."""
+        return self.loops[0].margins.crossover_hz
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tuned:
+    """New gains by their keys of [control], and both profiles judged."""
+
+    law: str
+    values: dict[str, float]
+    old_values: dict[str, float]
+    before: Assessment
+    after: Assessment
+
+
+def tuned(
+    profile: "Profile", law: str, asked: Asked, say: Callable[[str, float], None] = lambda what, share: None
+) -> Tuned:
+    """Find gains that keep what is asked.
+
+    Errors: RequestError where the identified model is unstable under every gain, or a bandwidth has no such margin.
+    """
+    say("judging the gains as they are", 0.0)
+    before = assessed(profile, law)
+    fixed, key = _rule(profile, law)
+    at = profile.model_copy(update={"control": profile.control.model_copy(update=fixed)})
+    say("searching", 0.2)
+    value = _searched(at, law, key, asked)
+    say("checking it everywhere", 0.7)
+    found = assessed(_with(at, key, value), law)
+    while asked.bandwidth_hz is None and not _keeps(found, asked):  # a place that is worse than the gap
+        value *= 0.9
+        if value < _SPAN[0] * getattr(profile.control, key):
+            break
+        found = assessed(_with(at, key, value), law)
+    _refuse(profile, law, asked, found)
+    rounded = float(f"{value:.4g}")
+    values = fixed | {key: rounded}
+    old = {name: float(getattr(profile.control, name)) for name in values}
+    return Tuned(law, values, old, before, assessed(_with(at, key, rounded), law))
+
+
+def assessed(profile: "Profile", law: str) -> Assessment:
+    """Judge a profile's gains with the machine that it believes in."""
+    body = believed_body(profile)
+    frequency_hz = grid_hz(profile.cycle.period_s)
+    loops = []
+    for place, said in PLACES.items():
+        if place != GAP and profile.micro is None:
+            continue
+        one = linearise(profile, law, body, place)
+        loops.append(Loop(said, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
+    if most := most_adaptive_gain_ratio(profile, law):
+        one = linearise(profile, law, body, GAP, most)
+        loops.append(Loop(CEILING, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
+    in_gap = linearise(profile, law, body)
+    hold_m, peak_m = math.nan, math.nan
+    if loops[0].margins.is_stable:
+        hold_m = shares.total_rms_m(profile, law, noises_of(profile), body)
+        peak_m = step_peak_m(in_gap)
+    stable = all(linearise(profile, law, _heavier(body, profile, ratio)).closed().is_stable() for ratio in _OFF)
+    return Assessment(tuple(loops), hold_m, peak_m, stable)
+
+
+def most_adaptive_gain_ratio(profile: "Profile", law: str) -> float:
+    """Return the ceiling of the adaptive gain; 0 where a law has none."""
+    return profile.control.adaptive_gain_ceiling_ratio if law == "dsmc" else 0.0
+
+
+def step_peak_m(loop: Linearised) -> float:
+    """Return the greatest error after a step of STEP_N on the axis that carries the end."""
+    force_n = np.full(round(0.5 / loop.period_s), STEP_N)
+    force_n[0] = 0.0
+    moved_m = shares.answer(loop.closed(), {f"{loop.precise_axis}_force_n": force_n}, "end_position_m")
+    return float(np.max(np.abs(moved_m)))
+
+
+_OFF = (1.0 - MASS_RATIO, 1.0 + MASS_RATIO)
+
+
+def _heavier(body: Body, profile: "Profile", ratio: float) -> Body:
+    parameters = body.parameters.copy()
+    parameters[f"{profile.axes[-1]}_mass_kg"] *= ratio
+    return replace(body, parameters=parameters)
+
+
+def _rule(profile: "Profile", law: str) -> tuple[dict[str, float], str]:
+    """Return the gains that the rules fix, and the key of the one that is searched."""
+    axis = profile.axes[-1]
+    if law == "pid":
+        return {}, "pid_bandwidth_hz" if profile.micro is not None else "macro_bandwidth_hz"
+    noise = profile.axis(axis).mass_kg * profile.interferometer.noise_m * math.sqrt(profile.cycle.period_s)
+    rate_per_s = 2.0 * math.pi * profile.cycle.rate_hz
+    fixed = {
+        "eta_ratio": _ETA_RATIO,
+        "gamma_ratio": 0.25 * _ETA_RATIO**2,
+        "sliding_ratio": 1.0,
+        f"{axis}_drift_n_per_sqrt_s": float(f"{(_WALK_RATIO * rate_per_s) ** 3 * noise:.3g}"),
+    }
+    if axis == "micro":
+        fixed["micro_white_n_sqrt_s"] = float(f"{(_WHITE_RATIO * rate_per_s) ** 2 * noise:.3g}")
+    return fixed, f"{axis}_bandwidth_hz"
+
+
+def _with(profile: "Profile", key: str, value: float) -> "Profile":
+    return profile.model_copy(update={"control": profile.control.model_copy(update={key: value})})
+
+
+def _searched(profile: "Profile", law: str, key: str, asked: Asked) -> float:
+    """Return the greatest value that keeps the margins in the gap, or the one that has the bandwidth asked for."""
+    now = getattr(profile.control, key)
+    body = believed_body(profile)
+
+    most = most_adaptive_gain_ratio(profile, law) if asked.bandwidth_hz is None else 0.0
+
+    def found(value: float) -> Margins:
+        return margins(linearise(_with(profile, key, value), law, body, GAP, most))
+
+    def keeps(value: float) -> bool:
+        one = found(value)
+        if asked.bandwidth_hz is not None:
+            return one.is_stable and one.crossover_hz <= asked.bandwidth_hz
+        return one.is_stable and _within(one, asked)
+
+    values = np.geomspace(_SPAN[0], _SPAN[1], _GRID_COUNT) * now
+    kept = [k for k, value in enumerate(values) if keeps(float(value))]
+    if not kept:
+        least = found(float(values[_GRID_COUNT // 2]))
+        if not any(found(float(value)).is_stable for value in values):
+            raise RequestError(
+                f"profile {profile.name}: the identified model is unstable under {law} with every "
+                f"control.{key} from {values[0]:.3g} to {values[-1]:.3g}; shorten cycle.actuation_delay_s, or check "
+                "mass_kg and rated_force_n (`stagectl gap`)"
+            )
+        remedy = "allow less margin" if asked.bandwidth_hz is None else "ask for another bandwidth"
+        raise RequestError(
+            f"profile {profile.name}: no control.{key} keeps {_said(asked)}; with {now:.3g} the "
+            f"greatest sensitivity is {least.sensitivity_peak_ratio:.2f}, the delay margin "
+            f"{least.delay_margin_s * 1e3:.2f} ms, the crossover {least.crossover_hz:.0f} Hz; {remedy}, or "
+            "shorten cycle.actuation_delay_s"
+        )
+    low = float(values[kept[-1]])
+    if kept[-1] == _GRID_COUNT - 1:
+        return low
+    high = float(values[kept[-1] + 1])
+    for _ in range(_BISECTIONS):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if keeps(middle) else (low, middle)
+    return low
+
+
+def _within(one: Margins, asked: Asked) -> bool:
+    return one.sensitivity_peak_ratio <= asked.max_sensitivity and one.delay_margin_s >= asked.delay_margin_s
+
+
+def _keeps(found: Assessment, asked: Asked) -> bool:
+    return (
+        found.worst_sensitivity <= asked.max_sensitivity * _SLACK
+        and found.least_delay_margin_s >= asked.delay_margin_s / _SLACK
+        and found.stable_with_other_mass
+    )
+
+
+def _refuse(profile: "Profile", law: str, asked: Asked, found: Assessment) -> None:
+    """Refuse what is unstable, then what keeps too little margin; both with the place and the value."""
+    for one in found.loops:
+        if not one.margins.is_stable:
+            raise RequestError(
+                f"profile {profile.name} under {law} would be unstable ({one.place}); ask for less bandwidth, or check "
+                "the joint's stiffness (`stagectl identify`)"
+            )
+    if not found.stable_with_other_mass:
+        raise RequestError(
+            f"profile {profile.name} under {law} would be unstable with a mass {100.0 * MASS_RATIO:.0f} % off; ask for "
+            "less bandwidth"
+        )
+    if not _keeps(found, asked):
+        worst = max(found.loops, key=lambda one: one.margins.sensitivity_peak_ratio)
+        raise RequestError(
+            f"profile {profile.name} under {law}: {_said(asked)} can't be kept: greatest sensitivity "
+            f"{found.worst_sensitivity:.2f} ({worst.place}), delay margin {found.least_delay_margin_s * 1e3:.2f} ms; "
+            "ask for less bandwidth (without --bandwidth-hz the greatest possible is taken), or allow less margin"
+        )
+
+
+def _said(asked: Asked) -> str:
+    said = f"sensitivity <= {asked.max_sensitivity:g}, delay margin >= {asked.delay_margin_s * 1e3:g} ms"
+    return said if asked.bandwidth_hz is None else f"a bandwidth of {asked.bandwidth_hz:g} Hz with {said}"
