@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from stagectl.effects import CATALOGUE, Trait
+from stagectl.effects import CATALOGUE
 from stagectl.gap.normal_equations import Fold, Group, Sums, held_out_gain, solve, within_bounds
 
 NULL_QUANTILE = 0.99
@@ -40,9 +40,6 @@ ALIAS_GAIN = 8.6
 """Log-likelihood ratio (twice) below which two names can't be told apart: power 0.9 at 5 % false alarms."""
 
 ALIAS_SHARE = 0.002
-LATE_SHARE = 0.12
-"""The share between two late readings: beside prompt commands they disagree on the velocity that both laws are made of,
-and a lag of 0.45 ms at d' 45 lost a tenth of its gain to a delay."""
 
 LOW_SPEED_SHARE = 0.02
 """Of a machine with more force noise than its sensors explain, no friction is an exact law: at speed, where a velocity
@@ -275,8 +272,6 @@ class Judge:
 
     def _inexact_share(self, group: Group, other: Group) -> float:
         """Return the share of a gain that two laws must differ by to be told apart."""
-        if _is_late_reading(group) and _is_late_reading(other):
-            return LATE_SHARE
         if self.is_rough and _shows_at_low_speed(group) and _shows_at_low_speed(other):
             return LOW_SPEED_SHARE
         return ALIAS_SHARE
@@ -285,8 +280,3 @@ class Judge:
 def _shows_at_low_speed(group: Group) -> bool:
     known = CATALOGUE.get(group.key[0])
     return known is not None and known.shown_by == "low speed"
-
-
-def _is_late_reading(group: Group) -> bool:
-    known = CATALOGUE.get(group.key[0])
-    return known is not None and Trait.LATE_READING in known.traits
