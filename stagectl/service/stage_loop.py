@@ -3,7 +3,6 @@
 Clients reach it through `Desk`; nothing here waits for one of them, and nothing that the servo waits for is here.
 """
 
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,11 +15,11 @@ import numpy as np
 from stagectl.errors import DriveError, LinkError, ProfileError, RequestError, StagectlError
 from stagectl.profile import Profile, load_profile
 from stagectl.requests import Phase
-from stagectl.ring import RingReader, writer_alive
 from stagectl.run_folder import give_back
 from stagectl.service import faults, messages, recording, states
 from stagectl.service.desk import Desk, Order
 from stagectl.service.exposition import Figures
+from stagectl.service.motions import MOTIONS
 from stagectl.service.notify import Notifier
 from stagectl.service.recording import Recording
 from stagectl.service.remembered import Remembered, keep
@@ -28,8 +27,9 @@ from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import Event, State
 from stagectl.service.view import BANNERS, backlash_message, health, limits, positions
+from stagectl.service.world import missing
 from stagectl.signals import Stop
-from stagectl.stage import choose, open_stage, present
+from stagectl.stage import choose, open_stage
 from stagectl.supervisor import Outcome, Supervisor
 
 _RETRY_S, _RETRY_AFTER_FAILURE_S = 2.0, 5.0
@@ -86,12 +86,6 @@ class StageLoop:
         self._homed = False
         self._order: Order | None = None
         self._work: dict[str, Callable[[Order], None]] = {
-            "arm": self._do_arm,
-            "home": self._do_home,
-            "move": self._do_move,
-            "jog": self._do_jog,
-            "jog_at": self._do_jog_at,
-            "identify": self._do_identify,
             "acknowledge": self._do_acknowledge,
             "backend": self._do_backend,
             "reread": self._do_reread,
@@ -107,6 +101,8 @@ class StageLoop:
         try:
             while not self._leaving:
                 self.step()
+        except Leaving:
+            pass  # while a world was opened, and what of it was there is closed
         finally:
             self._leave()
 
@@ -128,8 +124,8 @@ class StageLoop:
 
     def leave(self) -> None:
         """Have `run` end; the stage comes to rest first. May be called from a signal handler."""
-        self._leaving = True  # nothing else: locks may be held by what the signal interrupted
-        if self._opening:
+        again, self._leaving = self._leaving, True  # nothing else: what the signal interrupted may hold locks
+        if self._opening and not again:
             raise Leaving
 
     def reread(self) -> None:
@@ -206,9 +202,9 @@ class StageLoop:
             if not self._backend:
                 self._backend = choose(profile, self._backend_asked)
                 self._log.say("backend", BANNERS[self._backend], backend=self._backend, asked=self._backend_asked)
-            missing = self._missing(profile)
-            if missing:
-                self._wait_for(missing)
+            absent = missing(profile, self._backend, self.settings.runs_root)
+            if absent:
+                self._wait_for(absent)
                 return
         except (ProfileError, LinkError) as error:
             self._wait_for(str(error))
@@ -258,23 +254,6 @@ class StageLoop:
         self.desk.profile = stage.profile
         self._keep(profile=str(profile.source_path), profile_name=profile.name, backend=self._backend)
         self._enter(Event.CONNECTED, stage.backend.description)
-
-    def _missing(self, profile: Profile) -> str:
-        """Say what hardware is not there, or who still has it; empty where all is ready."""
-        if self._backend != "hardware":
-            return ""
-        absent = [name for name, there in present(profile).items() if not there]
-        if absent:
-            return f"{', '.join(absent)}: not there; plug it in, or ask for another backend"
-        for ring in sorted(Path("/dev/shm").glob("stagectl-*.ring")):
-            try:
-                reader = RingReader(ring)
-            except StagectlError:
-                continue
-            mine = reader.run_folder is not None and self.settings.runs_root.resolve() in reader.run_folder.parents
-            if mine and writer_alive(ring):
-                return f"servo {reader.writer_pid} of the last service still brings the stage to rest"
-        return ""
 
     def _wait_for(self, what: str) -> None:
         if what != self._waiting_for:
@@ -356,7 +335,7 @@ class StageLoop:
             return
         status = stage.status()
         phase, stop = Phase(int(status["phase"])), Stop(int(status["stop"]))
-        if phase is Phase.TRACKING:
+        if phase is Phase.TRACKING and self._state is not State.STOPPING:
             self._enter(Event.HELD, name)
         elif phase is Phase.STOPPED and stop is not Stop.OPERATOR:
             self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), self._next_fault()))
@@ -425,7 +404,7 @@ class StageLoop:
             self.desk.check_order(order)
             order.begin()
             self._log.say("command", order.name, key=order.key, body=order.body.model_dump())
-            self._work[order.name](order)
+            self._work.get(order.name, self._move)(order)
         except StagectlError as error:
             order.fail(error)
             self._log.say("command_failed", str(error), name=order.name, key=order.key, kind=type(error).__name__)
@@ -441,32 +420,33 @@ class StageLoop:
     def _after_refusal(self) -> None:
         """A request that was refused half way leaves the stage holding, or on its way to rest."""
         stage = self._stage
-        if stage is None or self._state not in states.POWERED:
+        if stage is None or self._state not in states.POWERED - {State.ARMED}:
             return
         if stage.status()["phase"] == Phase.TRACKING and stage.status()["segment_left_rows"] > 0:
             self._rest("refused half way")
         else:
             self._settle("refused")
 
-    def _motion(self, order: Order, event: Event, work: Callable[[Supervisor], Outcome]) -> Outcome:
+    def _move(self, order: Order) -> None:
         """Do a motion and bring the state into line with how it ended."""
-        stage = self._connected()
-        states.after(self._state, event)
-        if event in (Event.ARM, Event.MOVE, Event.IDENTIFY) and not self._homed:
+        motion, stage = MOTIONS[order.name], self._connected()
+        states.after(self._state, motion.event)
+        if motion.needs_homing and not self._homed:
             raise RequestError(f"{order.name}: the stage is not homed since it was connected; home it first")
         stage.allow_motion()
         if self._state is State.IDLE:
             self._recording.begin(order.name, recording.ARM, stage.link.now_t_ns())
         folder = self._recording.folder(stage.folder)
-        self._enter(event, order.name)
-        outcome = work(stage)
-        if order.name == "home":
+        self._enter(motion.event, order.name)
+        if not motion.needs_homing:
+            self._homed = False
+        outcome = motion.work(stage, order)
+        if not motion.needs_homing:
             self._homed = outcome.finished
         self._settle(order.name)
-        backlash = self._kept_backlash(outcome, folder.name) if order.name in ("home", "identify") else None
+        backlash = self._kept_backlash(outcome, folder.name) if motion.identifies else None
         order.finish(outcome.text, outcome.stop.name, str(folder), backlash)
         self._log.say("command_done", outcome.text, name=order.name, key=order.key, stop=outcome.stop.name)
-        return outcome
 
     def _kept_backlash(self, outcome: Outcome, run: str) -> messages.Backlash | None:
         estimate, stage = outcome.backlash, self._stage
@@ -480,29 +460,6 @@ class StageLoop:
         if self._stage is None:
             raise RequestError(f"the stage is not connected; waiting for: {self._waiting_for or 'an acknowledgement'}")
         return self._stage
-
-    def _do_arm(self, order: Order) -> None:
-        self._motion(order, Event.ARM, lambda stage: stage.armed(order.body.law))
-
-    def _do_home(self, order: Order) -> None:
-        self._homed = False
-        self._motion(order, Event.HOME, lambda stage: stage.home())
-
-    def _do_move(self, order: Order) -> None:
-        self._motion(order, Event.MOVE, lambda stage: stage.move(order.body.target_m, order.body.law))
-
-    def _do_jog(self, order: Order) -> None:
-        def by_distance(stage: Supervisor) -> Outcome:
-            return stage.move(float(stage.status()["setpoint_position_m"]) + order.body.distance_m, order.body.law)
-
-        self._motion(order, Event.MOVE, by_distance)
-
-    def _do_jog_at(self, order: Order) -> None:
-        self._motion(order, Event.MOVE, lambda stage: stage.jog(order.wanted_m_per_s))
-
-    def _do_identify(self, order: Order) -> None:
-        body = order.body
-        self._motion(order, Event.IDENTIFY, lambda stage: stage.identify(body.frequency_hz, body.duration_s))
 
     def _do_acknowledge(self, order: Order) -> None:
         if self._fault is None or self._state is not State.FAULT:
@@ -581,10 +538,3 @@ class StageLoop:
             version=_VERSION,
             uptime_s=time.monotonic() - self._began_s,
         )
-
-
-def hear_signals(loop: StageLoop) -> None:
-    """SIGTERM and Ctrl-C end the service, SIGHUP has it read its profile again."""
-    signal.signal(signal.SIGTERM, lambda number, frame: loop.leave())
-    signal.signal(signal.SIGINT, lambda number, frame: loop.leave())
-    signal.signal(signal.SIGHUP, lambda number, frame: loop.reread())
