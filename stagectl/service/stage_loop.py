@@ -8,11 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from stagectl.errors import DriveError, LinkError, ProfileError, RequestError, StagectlError
+from stagectl.errors import DriveError, LinkError, ProfileError, RequestError, StagectlError, TimingError
 from stagectl.profile import Profile, load_profile
 from stagectl.requests import Phase
 from stagectl.run_folder import give_back
@@ -22,7 +21,7 @@ from stagectl.service.exposition import Figures
 from stagectl.service.motions import MOTIONS
 from stagectl.service.notify import Notifier
 from stagectl.service.recording import Recording
-from stagectl.service.remembered import Remembered, keep
+from stagectl.service.remembered import Memory, Remembered
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import Event, State
@@ -35,6 +34,7 @@ from stagectl.supervisor import Outcome, Supervisor
 _RETRY_S, _RETRY_AFTER_FAILURE_S = 2.0, 5.0
 _CONNECT_S = 240.0  # a cold compile cache on a slow host
 _CLOSE_S = 60.0  # coming to rest, rows to the disk
+_STALL_S = 1.5  # without a cycle: three times what the servo grants this side
 _LATENESS_EVERY_S = 0.5
 _ENDING = "the service was asked to end"
 _VERSION = metadata.version("stagectl")
@@ -70,7 +70,7 @@ class StageLoop:
     ):
         """Hold the parts; `run` opens the stage."""
         self.settings, self.desk, self._log, self._notifier, self._figures = settings, desk, log, notifier, figures
-        self._remembered = remembered
+        self._memory = Memory(settings.state_folder, remembered, self._say_not_kept)
         self._recording = Recording(settings.runs_root, log)
         self._began_s = time.monotonic()
         self._profile_asked, self._backend_asked = settings.profile, settings.backend
@@ -92,6 +92,7 @@ class StageLoop:
         }
         self._late: tuple[float, float] | None = None
         self._late_at_s = 0.0
+        self._cycles_seen, self._cycles_seen_s = -1, 0.0
 
     # ---- the loop --------------------------------------------------------------------------------------------
 
@@ -210,7 +211,7 @@ class StageLoop:
             self._wait_for(str(error))
             return
         except RequestError as error:
-            self._trip(faults.of_error(error, self._state, now_text(), self._next_fault()))
+            self._trip(self._fault_of(error))
             return
         self._wait_for("opening the stage")
         self._notifier.allow(_CONNECT_S)
@@ -236,13 +237,14 @@ class StageLoop:
             self.desk.scope = self._scope
             stage.__enter__()
             self._stage, self._homed, self._waiting_for = stage, False, ""
+            self._cycles_seen = -1
         except Leaving:
             return
         except LinkError as error:
             self._wait_for(str(error))
             return
         except StagectlError as error:
-            self._trip(faults.of_error(error, self._state, now_text(), self._next_fault()))
+            self._trip(self._fault_of(error))
             return
         finally:
             self._opening = False
@@ -252,7 +254,7 @@ class StageLoop:
                 self._recording.discard(folder)
             self._retry_at_s = time.monotonic() + _RETRY_AFTER_FAILURE_S
         self.desk.profile = stage.profile
-        self._keep(profile=str(profile.source_path), profile_name=profile.name, backend=self._backend)
+        self._memory.keep(profile=str(profile.source_path), profile_name=profile.name, backend=self._backend)
         self._enter(Event.CONNECTED, stage.backend.description)
 
     def _wait_for(self, what: str) -> None:
@@ -308,12 +310,22 @@ class StageLoop:
         except StagectlError as error:
             self._break(error)
             return
+        if self._stands_still(int(status["rows"])):
+            self._break(TimingError(f"the servo has done no cycle for {_STALL_S:g} s; it hangs, or the host does"))
+            return
         if status["reference_lost"]:
             self._homed = False
         if self._state is not State.FAULT and status["phase"] == Phase.STOPPED:
             self._settle()
         elif self._state is State.ARMED and status["phase"] != Phase.TRACKING:
             self._wait_until_it_stands()
+
+    def _stands_still(self, cycles_count: int) -> bool:
+        """Tell whether the servo's counter has stood still for long; a process that is gone is noticed at once."""
+        now_s = time.monotonic()
+        if cycles_count != self._cycles_seen:
+            self._cycles_seen, self._cycles_seen_s = cycles_count, now_s
+        return now_s - self._cycles_seen_s > _STALL_S
 
     def _wait_until_it_stands(self) -> None:
         """Let a stage that stops by itself do so; then say why."""
@@ -338,7 +350,7 @@ class StageLoop:
         if phase is Phase.TRACKING and self._state is not State.STOPPING:
             self._enter(Event.HELD, name)
         elif phase is Phase.STOPPED and stop is not Stop.OPERATOR:
-            self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), self._next_fault()))
+            self._trip_by(stop, stage)
         else:
             self._rest(name)
 
@@ -355,7 +367,7 @@ class StageLoop:
             self._break(error)
             return
         if stop not in (Stop.NONE, Stop.OPERATOR):
-            self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), self._next_fault()))
+            self._trip_by(stop, stage)
         elif self._state in (State.MOVING, State.STOPPING):
             self._enter(Event.RESTED, name)
 
@@ -379,21 +391,19 @@ class StageLoop:
     def _break(self, error: StagectlError) -> None:
         """What broke on this side: bring the stage to rest, let go of it, and say so."""
         self._breaking = True  # the run ends when the last rows are in it
-        self._trip(faults.of_error(error, self._state, now_text(), self._next_fault()))
+        self._trip(self._fault_of(error))
         self._close_stage()
         self._breaking = False
 
-    def _next_fault(self) -> int:
-        count = self._remembered.faults_count + 1
-        self._keep(faults_count=count)
-        return count
+    def _say_not_kept(self, text: str) -> None:
+        self._log.say("state_not_kept", text)
 
-    def _keep(self, **changes: Any) -> None:
-        self._remembered = self._remembered.model_copy(update=changes)
-        try:
-            keep(self.settings.state_folder, self._remembered)
-        except StagectlError as error:
-            self._log.say("state_not_kept", str(error))
+    def _fault_of(self, error: StagectlError) -> messages.Fault:
+        return faults.of_error(error, self._state, now_text(), self._memory.next_fault_number())
+
+    def _trip_by(self, stop: Stop, stage: Supervisor) -> None:
+        number = self._memory.next_fault_number()
+        self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), number))
 
     # ---- commands --------------------------------------------------------------------------------------------
 
@@ -453,7 +463,7 @@ class StageLoop:
         if estimate is None or not outcome.finished or not estimate.identifiable or stage is None:
             return None
         found = backlash_message(estimate, run, stage.profile.name, now_text())
-        self._keep(backlash=found)
+        self._memory.keep(backlash=found)
         return found
 
     def _connected(self) -> Supervisor:
@@ -478,10 +488,10 @@ class StageLoop:
             try:
                 again = stage.acknowledge()
             except DriveError as error:  # still in fault: the world is as open as before
-                self._trip(faults.of_error(error, self._state, now_text(), self._next_fault()))
+                self._trip(self._fault_of(error))
                 raise RequestError(str(error)) from error
             if again is not Stop.NONE:
-                self._trip(faults.of_stop(again, stage.detail, self._state, now_text(), self._next_fault()))
+                self._trip_by(again, stage)
                 raise RequestError(f"it stopped again at once: {stage.detail or again.name}; clear the cause first")
             self._homed = self._homed and not stage.status()["reference_lost"]
             self._enter(Event.ACKNOWLEDGE, "acknowledged")
@@ -529,7 +539,7 @@ class StageLoop:
             limits=limits(stage.profile if stage is not None else profile),
             positions=positions(status),
             health=health(status, profile.cycle.rate_hz if profile is not None else 0.0, self._late),
-            backlash=self._remembered.backlash,
+            backlash=self._memory.now.backlash,
             fault=self._fault,
             lease=self.desk.lease_state(),
             command=order.message() if order is not None else None,
