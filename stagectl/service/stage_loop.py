@@ -392,6 +392,7 @@ class StageLoop:
         """What broke on this side: bring the stage to rest, let go of it, and say so."""
         self._breaking = True  # the run ends when the last rows are in it
         self._trip(self._fault_of(error))
+        self._tick()  # said at once: closing may take as long as a servo that hangs is given
         self._close_stage()
         self._breaking = False
 
