@@ -169,7 +169,7 @@ def show(folder: Path) -> dict[str, Any]:
     """Describe one run for people and for --json: what, how long, how it ended, health of its cycles, events."""
     run = read_run(folder)
     rows = run.rows
-    summary = _summary(run.folder)
+    summary = _summary(run.folder, True)
     missing_count, note = run.rows_missing_count, summary.note
     if missing_count:
         note = missing_text(missing_count, missing_count + len(rows))
