@@ -27,7 +27,7 @@ from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import Event, State
 from stagectl.service.view import BANNERS, backlash_message, health, limits, positions
 from stagectl.service.world import missing
-from stagectl.signals import Stop
+from stagectl.signals import STOP_TEXT, Stop
 from stagectl.stage import choose, open_stage
 from stagectl.supervisor import Outcome, Supervisor
 
@@ -161,7 +161,7 @@ class StageLoop:
             return
         try:
             if asked == "":
-                self._recording.end(recording.REQUEST, text="a client asked for its end")
+                self._recording.end(recording.REQUEST, Stop.OPERATOR.name, STOP_TEXT[Stop.OPERATOR])
             else:
                 self._recording.begin(asked, recording.REQUEST, stage.link.now_t_ns())
         except RequestError as error:
@@ -185,13 +185,14 @@ class StageLoop:
             self._notifier.say(STATUS=f"{self._state.value}, {self._backend or 'no world'}")
         self.desk.powered = self._state in states.POWERED
         if before in states.POWERED and not self.desk.powered and not self._breaking:
-            self._recording.end(recording.ARM, *self._why(event))
+            self._recording.end(recording.ARM, *self._why(event, before))
 
-    def _why(self, event: Event) -> tuple[str, str]:
+    def _why(self, event: Event, before: State) -> tuple[str, str]:
         """Return how the run of a powered stage ended: the Stop's name, and the sentence."""
         if event is Event.TRIPPED and self._fault is not None:
             return self._fault.kind, f"{self._fault.what}: {self._fault.values}"
-        return "", ""
+        stop = Stop.FINISHED if before is State.MOVING else Stop.OPERATOR
+        return stop.name, STOP_TEXT[stop]
 
     # ---- opening and closing ---------------------------------------------------------------------------------
 

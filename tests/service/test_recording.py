@@ -189,6 +189,8 @@ def test_powered_motion_is_recorded_and_a_fault_while_idle_has_its_last_seconds(
     (motion,) = runs_of(bench, "arm")
     run = read_run(motion)
     assert run.manifest["record"]["state"] == "closed"
+    assert run.manifest["end"]["stop"] == "OPERATOR"
+    assert read_run(home).manifest["end"]["stop"] == "FINISHED"
     assert Phase.TRACKING in run.rows["run_phase"]
     assert "segment" in [event["event"] for event in run.events]
     assert np.all(np.diff(run.rows["cycle"]) == 1)
