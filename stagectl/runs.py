@@ -77,8 +77,10 @@ class RunSummary:
     note: str = ""
 
 
-def list_runs(root: Path) -> list[RunSummary]:
+def list_runs(root: Path, count_under_way: bool = True) -> list[RunSummary]:
     """Summarise every run folder under `root`, oldest first; a damaged run is listed and raises nothing.
+
+    Rows of a run under way are counted by reading them; without `count_under_way` they are 0.
 
     Errors: RequestError where `root` is a file.
     """
@@ -88,10 +90,10 @@ def list_runs(root: Path) -> list[RunSummary]:
     if not root.is_dir():
         return []
     folders = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
-    return [_summary(folder) for folder in folders]
+    return [_summary(folder, count_under_way) for folder in folders]
 
 
-def _summary(folder: Path) -> RunSummary:
+def _summary(folder: Path, count_under_way: bool) -> RunSummary:
     try:
         manifest = read_manifest(folder)
         record = manifest.get("record", {})
@@ -102,7 +104,7 @@ def _summary(folder: Path) -> RunSummary:
         if state == "recording":
             state = "recording" if is_held(folder / SAMPLES) else "crashed"
             count = 0
-            for rows in read_batches(folder):
+            for rows in read_batches(folder) if count_under_way or state == "crashed" else ():
                 first_t_ns = int(rows["t_ns"][0]) if first_t_ns is None else first_t_ns
                 last_t_ns = int(rows["t_ns"][-1])
                 count += len(rows)
@@ -167,7 +169,7 @@ def show(folder: Path) -> dict[str, Any]:
     """Describe one run for people and for --json: what, how long, how it ended, health of its cycles, events."""
     run = read_run(folder)
     rows = run.rows
-    summary = _summary(run.folder)
+    summary = _summary(run.folder, True)
     missing_count, note = run.rows_missing_count, summary.note
     if missing_count:
         note = missing_text(missing_count, missing_count + len(rows))

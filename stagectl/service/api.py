@@ -133,7 +133,7 @@ def _watch_routes(app: FastAPI, desk: Desk, log: ServiceLog, figures: Figures, r
 
     @app.get("/v1/runs")
     def runs() -> list[messages.RunEntry]:
-        """What was recorded, oldest first."""
+        """What was recorded, oldest first; rows of a run under way are not counted."""
         from stagectl.runs import list_runs
 
         return [
@@ -146,7 +146,7 @@ def _watch_routes(app: FastAPI, desk: Desk, log: ServiceLog, figures: Figures, r
                 stop=run.stop,
                 text=run.note or run.text,
             )
-            for run in list_runs(runs_root)
+            for run in list_runs(runs_root, count_under_way=False)
         ]
 
     @app.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})

@@ -1,5 +1,6 @@
 """`stagectl serve`: the parts put together. The main thread is the stage's, a second one answers clients."""
 
+import signal
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
@@ -15,7 +16,7 @@ from stagectl.service.notify import Notifier
 from stagectl.service.places import listen_tcp, listen_unix
 from stagectl.service.remembered import recall
 from stagectl.service.service_log import ServiceLog
-from stagectl.service.stage_loop import Settings, StageLoop, hear_signals
+from stagectl.service.stage_loop import Settings, StageLoop
 
 TOKENS = "tokens"
 
@@ -54,3 +55,10 @@ def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
         listener.close()
         socket_path.unlink(missing_ok=True)
         log.say("ended")
+
+
+def hear_signals(loop: StageLoop) -> None:
+    """SIGTERM and Ctrl-C end the service, SIGHUP has it read its profile again."""
+    signal.signal(signal.SIGTERM, lambda number, frame: loop.leave())
+    signal.signal(signal.SIGINT, lambda number, frame: loop.leave())
+    signal.signal(signal.SIGHUP, lambda number, frame: loop.reread())

@@ -16,22 +16,13 @@ from stagectl.profile import Profile
 from stagectl.service import lease as leases
 from stagectl.service import messages, states
 from stagectl.service.lease import Lease
+from stagectl.service.motions import MOTIONS
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
-from stagectl.service.states import Event, State
+from stagectl.service.states import State
 from stagectl.service.view import jog_velocity_m_per_s
 
 _KEPT_ORDERS_COUNT = 1000
-
-_EVENTS = {
-    "arm": Event.ARM,
-    "home": Event.HOME,
-    "move": Event.MOVE,
-    "jog": Event.MOVE,
-    "jog_at": Event.MOVE,
-    "identify": Event.IDENTIFY,
-}
-"""What a command does to the state; the others have none of their own."""
 
 
 class Busy(RequestError):
@@ -253,8 +244,8 @@ class Desk:
             self._refuse_when_closed()
             leases.holds(self._lease, token, self._clock_s())
             self._refuse_when_busy(name)
-            if name in _EVENTS:
-                states.after(self._state, _EVENTS[name])
+            if name in MOTIONS:
+                states.after(self._state, MOTIONS[name].event)
             self._check_values(name, body)
             order = Order(key, name, body, token, self._clock_s)
             if name == "jog_at":

@@ -70,13 +70,13 @@ class Recording:
         if flight.run_folder is not None:
             self._log.say("run", "begun", run=flight.run_folder.name, trigger=trigger)
 
-    def end(self, trigger: str, stop: str = "", text: str = "") -> None:
+    def end(self, trigger: str, stop: str, text: str) -> None:
         """End the run under way where `trigger` began it."""
         flight = self._flight
         if flight is None or flight.run_folder is None or flight.trigger != trigger:
             return
         try:
-            folder = flight.end_run({"stop": stop or "FINISHED", "text": text or "the stage rests without power"})
+            folder = flight.end_run({"stop": stop, "text": text})
         except RecordError as error:
             self._log.say("record_lost", str(error))
             return

@@ -5,7 +5,9 @@ Homing does not: a stage that nobody watched may be anywhere.
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -58,3 +60,24 @@ def keep(folder: Path, remembered: Remembered) -> None:
         raise RecordError(
             f"{path}: can't be kept: {error.strerror}; free space, or give another folder with --state"
         ) from error
+
+
+class Memory:
+    """What is remembered now, kept on the disk with every change; a disk that refuses is said and stops nothing."""
+
+    def __init__(self, folder: Path, remembered: Remembered, refused: Callable[[str], None]):
+        """Go on from what was recalled; `refused` hears what the disk says."""
+        self._folder, self.now, self._refused = folder, remembered, refused
+
+    def keep(self, **changes: Any) -> None:
+        """Change some of it."""
+        self.now = self.now.model_copy(update=changes)
+        try:
+            keep(self._folder, self.now)
+        except RecordError as error:
+            self._refused(str(error))
+
+    def next_fault_number(self) -> int:
+        """Count a fault; numbers go on over restarts."""
+        self.keep(faults_count=self.now.faults_count + 1)
+        return self.now.faults_count

@@ -3,38 +3,38 @@
 Clients reach it through `Desk`; nothing here waits for one of them, and nothing that the servo waits for is here.
 """
 
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from stagectl.errors import DriveError, LinkError, ProfileError, RequestError, StagectlError
+from stagectl.errors import DriveError, LinkError, ProfileError, RequestError, StagectlError, TimingError
 from stagectl.profile import Profile, load_profile
 from stagectl.requests import Phase
-from stagectl.ring import RingReader, writer_alive
 from stagectl.run_folder import give_back
 from stagectl.service import faults, messages, recording, states
 from stagectl.service.desk import Desk, Order
 from stagectl.service.exposition import Figures
+from stagectl.service.motions import MOTIONS
 from stagectl.service.notify import Notifier
 from stagectl.service.recording import Recording
-from stagectl.service.remembered import Remembered, keep
+from stagectl.service.remembered import Memory, Remembered
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import Event, State
 from stagectl.service.view import BANNERS, backlash_message, health, limits, positions
-from stagectl.signals import Stop
-from stagectl.stage import choose, open_stage, present
+from stagectl.service.world import missing
+from stagectl.signals import STOP_TEXT, Stop
+from stagectl.stage import choose, open_stage
 from stagectl.supervisor import Outcome, Supervisor
 
 _RETRY_S, _RETRY_AFTER_FAILURE_S = 2.0, 5.0
 _CONNECT_S = 240.0  # a cold compile cache on a slow host
 _CLOSE_S = 60.0  # coming to rest, rows to the disk
+_STALL_S = 1.5  # without a cycle: three times what the servo grants this side
 _LATENESS_EVERY_S = 0.5
 _ENDING = "the service was asked to end"
 _VERSION = metadata.version("stagectl")
@@ -70,7 +70,7 @@ class StageLoop:
     ):
         """Hold the parts; `run` opens the stage."""
         self.settings, self.desk, self._log, self._notifier, self._figures = settings, desk, log, notifier, figures
-        self._remembered = remembered
+        self._memory = Memory(settings.state_folder, remembered, self._say_not_kept)
         self._recording = Recording(settings.runs_root, log)
         self._began_s = time.monotonic()
         self._profile_asked, self._backend_asked = settings.profile, settings.backend
@@ -86,18 +86,13 @@ class StageLoop:
         self._homed = False
         self._order: Order | None = None
         self._work: dict[str, Callable[[Order], None]] = {
-            "arm": self._do_arm,
-            "home": self._do_home,
-            "move": self._do_move,
-            "jog": self._do_jog,
-            "jog_at": self._do_jog_at,
-            "identify": self._do_identify,
             "acknowledge": self._do_acknowledge,
             "backend": self._do_backend,
             "reread": self._do_reread,
         }
         self._late: tuple[float, float] | None = None
         self._late_at_s = 0.0
+        self._cycles_seen, self._cycles_seen_s = -1, 0.0
 
     # ---- the loop --------------------------------------------------------------------------------------------
 
@@ -107,6 +102,8 @@ class StageLoop:
         try:
             while not self._leaving:
                 self.step()
+        except Leaving:
+            pass  # while a world was opened, and what of it was there is closed
         finally:
             self._leave()
 
@@ -128,8 +125,8 @@ class StageLoop:
 
     def leave(self) -> None:
         """Have `run` end; the stage comes to rest first. May be called from a signal handler."""
-        self._leaving = True  # nothing else: locks may be held by what the signal interrupted
-        if self._opening:
+        again, self._leaving = self._leaving, True  # nothing else: what the signal interrupted may hold locks
+        if self._opening and not again:
             raise Leaving
 
     def reread(self) -> None:
@@ -164,7 +161,7 @@ class StageLoop:
             return
         try:
             if asked == "":
-                self._recording.end(recording.REQUEST, text="a client asked for its end")
+                self._recording.end(recording.REQUEST, Stop.OPERATOR.name, STOP_TEXT[Stop.OPERATOR])
             else:
                 self._recording.begin(asked, recording.REQUEST, stage.link.now_t_ns())
         except RequestError as error:
@@ -188,13 +185,14 @@ class StageLoop:
             self._notifier.say(STATUS=f"{self._state.value}, {self._backend or 'no world'}")
         self.desk.powered = self._state in states.POWERED
         if before in states.POWERED and not self.desk.powered and not self._breaking:
-            self._recording.end(recording.ARM, *self._why(event))
+            self._recording.end(recording.ARM, *self._why(event, before))
 
-    def _why(self, event: Event) -> tuple[str, str]:
+    def _why(self, event: Event, before: State) -> tuple[str, str]:
         """Return how the run of a powered stage ended: the Stop's name, and the sentence."""
         if event is Event.TRIPPED and self._fault is not None:
             return self._fault.kind, f"{self._fault.what}: {self._fault.values}"
-        return "", ""
+        stop = Stop.FINISHED if before is State.MOVING else Stop.OPERATOR
+        return stop.name, STOP_TEXT[stop]
 
     # ---- opening and closing ---------------------------------------------------------------------------------
 
@@ -206,15 +204,15 @@ class StageLoop:
             if not self._backend:
                 self._backend = choose(profile, self._backend_asked)
                 self._log.say("backend", BANNERS[self._backend], backend=self._backend, asked=self._backend_asked)
-            missing = self._missing(profile)
-            if missing:
-                self._wait_for(missing)
+            absent = missing(profile, self._backend, self.settings.runs_root)
+            if absent:
+                self._wait_for(absent)
                 return
         except (ProfileError, LinkError) as error:
             self._wait_for(str(error))
             return
         except RequestError as error:
-            self._trip(faults.of_error(error, self._state, now_text(), self._next_fault()))
+            self._trip(self._fault_of(error))
             return
         self._wait_for("opening the stage")
         self._notifier.allow(_CONNECT_S)
@@ -240,13 +238,14 @@ class StageLoop:
             self.desk.scope = self._scope
             stage.__enter__()
             self._stage, self._homed, self._waiting_for = stage, False, ""
+            self._cycles_seen = -1
         except Leaving:
             return
         except LinkError as error:
             self._wait_for(str(error))
             return
         except StagectlError as error:
-            self._trip(faults.of_error(error, self._state, now_text(), self._next_fault()))
+            self._trip(self._fault_of(error))
             return
         finally:
             self._opening = False
@@ -256,25 +255,8 @@ class StageLoop:
                 self._recording.discard(folder)
             self._retry_at_s = time.monotonic() + _RETRY_AFTER_FAILURE_S
         self.desk.profile = stage.profile
-        self._keep(profile=str(profile.source_path), profile_name=profile.name, backend=self._backend)
+        self._memory.keep(profile=str(profile.source_path), profile_name=profile.name, backend=self._backend)
         self._enter(Event.CONNECTED, stage.backend.description)
-
-    def _missing(self, profile: Profile) -> str:
-        """Say what hardware is not there, or who still has it; empty where all is ready."""
-        if self._backend != "hardware":
-            return ""
-        absent = [name for name, there in present(profile).items() if not there]
-        if absent:
-            return f"{', '.join(absent)}: not there; plug it in, or ask for another backend"
-        for ring in sorted(Path("/dev/shm").glob("stagectl-*.ring")):
-            try:
-                reader = RingReader(ring)
-            except StagectlError:
-                continue
-            mine = reader.run_folder is not None and self.settings.runs_root.resolve() in reader.run_folder.parents
-            if mine and writer_alive(ring):
-                return f"servo {reader.writer_pid} of the last service still brings the stage to rest"
-        return ""
 
     def _wait_for(self, what: str) -> None:
         if what != self._waiting_for:
@@ -329,12 +311,22 @@ class StageLoop:
         except StagectlError as error:
             self._break(error)
             return
+        if self._stands_still(int(status["rows"])):
+            self._break(TimingError(f"the servo has done no cycle for {_STALL_S:g} s; it hangs, or the host does"))
+            return
         if status["reference_lost"]:
             self._homed = False
         if self._state is not State.FAULT and status["phase"] == Phase.STOPPED:
             self._settle()
         elif self._state is State.ARMED and status["phase"] != Phase.TRACKING:
             self._wait_until_it_stands()
+
+    def _stands_still(self, cycles_count: int) -> bool:
+        """Tell whether the servo's counter has stood still for long; a process that is gone is noticed at once."""
+        now_s = time.monotonic()
+        if cycles_count != self._cycles_seen:
+            self._cycles_seen, self._cycles_seen_s = cycles_count, now_s
+        return now_s - self._cycles_seen_s > _STALL_S
 
     def _wait_until_it_stands(self) -> None:
         """Let a stage that stops by itself do so; then say why."""
@@ -356,10 +348,10 @@ class StageLoop:
             return
         status = stage.status()
         phase, stop = Phase(int(status["phase"])), Stop(int(status["stop"]))
-        if phase is Phase.TRACKING:
+        if phase is Phase.TRACKING and self._state is not State.STOPPING:
             self._enter(Event.HELD, name)
         elif phase is Phase.STOPPED and stop is not Stop.OPERATOR:
-            self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), self._next_fault()))
+            self._trip_by(stop, stage)
         else:
             self._rest(name)
 
@@ -376,7 +368,7 @@ class StageLoop:
             self._break(error)
             return
         if stop not in (Stop.NONE, Stop.OPERATOR):
-            self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), self._next_fault()))
+            self._trip_by(stop, stage)
         elif self._state in (State.MOVING, State.STOPPING):
             self._enter(Event.RESTED, name)
 
@@ -400,21 +392,20 @@ class StageLoop:
     def _break(self, error: StagectlError) -> None:
         """What broke on this side: bring the stage to rest, let go of it, and say so."""
         self._breaking = True  # the run ends when the last rows are in it
-        self._trip(faults.of_error(error, self._state, now_text(), self._next_fault()))
+        self._trip(self._fault_of(error))
+        self._tick()  # said at once: closing may take as long as a servo that hangs is given
         self._close_stage()
         self._breaking = False
 
-    def _next_fault(self) -> int:
-        count = self._remembered.faults_count + 1
-        self._keep(faults_count=count)
-        return count
+    def _say_not_kept(self, text: str) -> None:
+        self._log.say("state_not_kept", text)
 
-    def _keep(self, **changes: Any) -> None:
-        self._remembered = self._remembered.model_copy(update=changes)
-        try:
-            keep(self.settings.state_folder, self._remembered)
-        except StagectlError as error:
-            self._log.say("state_not_kept", str(error))
+    def _fault_of(self, error: StagectlError) -> messages.Fault:
+        return faults.of_error(error, self._state, now_text(), self._memory.next_fault_number())
+
+    def _trip_by(self, stop: Stop, stage: Supervisor) -> None:
+        number = self._memory.next_fault_number()
+        self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), number))
 
     # ---- commands --------------------------------------------------------------------------------------------
 
@@ -425,7 +416,7 @@ class StageLoop:
             self.desk.check_order(order)
             order.begin()
             self._log.say("command", order.name, key=order.key, body=order.body.model_dump())
-            self._work[order.name](order)
+            self._work.get(order.name, self._move)(order)
         except StagectlError as error:
             order.fail(error)
             self._log.say("command_failed", str(error), name=order.name, key=order.key, kind=type(error).__name__)
@@ -441,68 +432,46 @@ class StageLoop:
     def _after_refusal(self) -> None:
         """A request that was refused half way leaves the stage holding, or on its way to rest."""
         stage = self._stage
-        if stage is None or self._state not in states.POWERED:
+        if stage is None or self._state not in states.POWERED - {State.ARMED}:
             return
         if stage.status()["phase"] == Phase.TRACKING and stage.status()["segment_left_rows"] > 0:
             self._rest("refused half way")
         else:
             self._settle("refused")
 
-    def _motion(self, order: Order, event: Event, work: Callable[[Supervisor], Outcome]) -> Outcome:
+    def _move(self, order: Order) -> None:
         """Do a motion and bring the state into line with how it ended."""
-        stage = self._connected()
-        states.after(self._state, event)
-        if event in (Event.ARM, Event.MOVE, Event.IDENTIFY) and not self._homed:
+        motion, stage = MOTIONS[order.name], self._connected()
+        states.after(self._state, motion.event)
+        if motion.needs_homing and not self._homed:
             raise RequestError(f"{order.name}: the stage is not homed since it was connected; home it first")
         stage.allow_motion()
         if self._state is State.IDLE:
             self._recording.begin(order.name, recording.ARM, stage.link.now_t_ns())
         folder = self._recording.folder(stage.folder)
-        self._enter(event, order.name)
-        outcome = work(stage)
-        if order.name == "home":
+        self._enter(motion.event, order.name)
+        if not motion.needs_homing:
+            self._homed = False
+        outcome = motion.work(stage, order)
+        if not motion.needs_homing:
             self._homed = outcome.finished
         self._settle(order.name)
-        backlash = self._kept_backlash(outcome, folder.name) if order.name in ("home", "identify") else None
+        backlash = self._kept_backlash(outcome, folder.name) if motion.identifies else None
         order.finish(outcome.text, outcome.stop.name, str(folder), backlash)
         self._log.say("command_done", outcome.text, name=order.name, key=order.key, stop=outcome.stop.name)
-        return outcome
 
     def _kept_backlash(self, outcome: Outcome, run: str) -> messages.Backlash | None:
         estimate, stage = outcome.backlash, self._stage
         if estimate is None or not outcome.finished or not estimate.identifiable or stage is None:
             return None
         found = backlash_message(estimate, run, stage.profile.name, now_text())
-        self._keep(backlash=found)
+        self._memory.keep(backlash=found)
         return found
 
     def _connected(self) -> Supervisor:
         if self._stage is None:
             raise RequestError(f"the stage is not connected; waiting for: {self._waiting_for or 'an acknowledgement'}")
         return self._stage
-
-    def _do_arm(self, order: Order) -> None:
-        self._motion(order, Event.ARM, lambda stage: stage.armed(order.body.law))
-
-    def _do_home(self, order: Order) -> None:
-        self._homed = False
-        self._motion(order, Event.HOME, lambda stage: stage.home())
-
-    def _do_move(self, order: Order) -> None:
-        self._motion(order, Event.MOVE, lambda stage: stage.move(order.body.target_m, order.body.law))
-
-    def _do_jog(self, order: Order) -> None:
-        def by_distance(stage: Supervisor) -> Outcome:
-            return stage.move(float(stage.status()["setpoint_position_m"]) + order.body.distance_m, order.body.law)
-
-        self._motion(order, Event.MOVE, by_distance)
-
-    def _do_jog_at(self, order: Order) -> None:
-        self._motion(order, Event.MOVE, lambda stage: stage.jog(order.wanted_m_per_s))
-
-    def _do_identify(self, order: Order) -> None:
-        body = order.body
-        self._motion(order, Event.IDENTIFY, lambda stage: stage.identify(body.frequency_hz, body.duration_s))
 
     def _do_acknowledge(self, order: Order) -> None:
         if self._fault is None or self._state is not State.FAULT:
@@ -521,10 +490,10 @@ class StageLoop:
             try:
                 again = stage.acknowledge()
             except DriveError as error:  # still in fault: the world is as open as before
-                self._trip(faults.of_error(error, self._state, now_text(), self._next_fault()))
+                self._trip(self._fault_of(error))
                 raise RequestError(str(error)) from error
             if again is not Stop.NONE:
-                self._trip(faults.of_stop(again, stage.detail, self._state, now_text(), self._next_fault()))
+                self._trip_by(again, stage)
                 raise RequestError(f"it stopped again at once: {stage.detail or again.name}; clear the cause first")
             self._homed = self._homed and not stage.status()["reference_lost"]
             self._enter(Event.ACKNOWLEDGE, "acknowledged")
@@ -572,7 +541,7 @@ class StageLoop:
             limits=limits(stage.profile if stage is not None else profile),
             positions=positions(status),
             health=health(status, profile.cycle.rate_hz if profile is not None else 0.0, self._late),
-            backlash=self._remembered.backlash,
+            backlash=self._memory.now.backlash,
             fault=self._fault,
             lease=self.desk.lease_state(),
             command=order.message() if order is not None else None,
@@ -581,10 +550,3 @@ class StageLoop:
             version=_VERSION,
             uptime_s=time.monotonic() - self._began_s,
         )
-
-
-def hear_signals(loop: StageLoop) -> None:
-    """SIGTERM and Ctrl-C end the service, SIGHUP has it read its profile again."""
-    signal.signal(signal.SIGTERM, lambda number, frame: loop.leave())
-    signal.signal(signal.SIGINT, lambda number, frame: loop.leave())
-    signal.signal(signal.SIGHUP, lambda number, frame: loop.reread())

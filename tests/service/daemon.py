@@ -103,3 +103,12 @@ class Daemon:
                 self.process.wait()
         self.notes.close()
         self.err.close()
+
+
+def servo_pid(daemon: Daemon) -> int:
+    """Find the servo among the daemon's children."""
+    pid = daemon.process.pid
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        if b"stagectl.servo_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+            return int(child)
+    raise AssertionError("no servo")

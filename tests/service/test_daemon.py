@@ -4,8 +4,6 @@ import asyncio
 import json
 import signal
 import stat
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -224,15 +222,6 @@ def test_kill_9_of_the_daemon_stops_the_stage_and_loses_no_row(tmp_path):
         assert (record["state"], record["rows_lost_count"]) == ("recovered", 0)
     finally:
         daemon.end()
-
-
-def test_a_second_daemon_on_the_same_socket_is_refused(daemon, tmp_path):
-    command = [sys.executable, "-m", "stagectl.cli", "serve", "single-axis", "--backend", "rig"]
-    command += ["--socket", str(daemon.socket), "--state", str(tmp_path), "--runs", str(tmp_path / "runs")]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert ended.returncode == 3
-    assert "a service listens here already" in ended.stderr
-    assert isinstance(daemon.client.status(), messages.Status)
 
 
 def test_no_service_is_a_link_error(tmp_path):

@@ -110,3 +110,44 @@ def test_a_splice_goes_on_where_the_old_way_is_then():
 def test_a_jog_is_no_faster_than_it_may(velocity):
     with pytest.raises(RequestError, match=r"a jog may do 0.4 m/s"):
         jogging.wanted_speed(velocity, LIMITS)
+
+
+@pytest.fixture
+def standing(oled_profile, oled_machine, tmp_path):
+    """A stage that holds."""
+    backend = BatchBackend(oled_machine, seed=5)
+    with Supervisor(oled_profile, backend, tmp_path / "run") as stage:
+        home_by_truth(stage, backend.rig.plant_state())
+        assert stage.enable() is Stop.NONE
+        yield stage
+
+
+def test_a_splice_that_comes_too_late_is_not_taken(standing):
+    stage = standing
+    start = trajectories.MotionState(float(stage.status()["setpoint_position_m"]))
+    under_way = jogging.way(start, 0.02, LIMITS, TRAVEL_M, DT_S).setpoints
+    number = stage._begin_segment(under_way, "test")
+    stage.pump(0.4)
+    late = jogging.splice(under_way, 0, -0.02, LIMITS, TRAVEL_M, DT_S)[0]
+    stage._begin_segment(late.setpoints, "late", at_row=late.at_row)
+    status = stage.pump(0.1)
+    assert status["segment_number"] == number
+    done_rows = under_way.size - int(status["segment_left_rows"])
+    assert status["setpoint_position_m"] == under_way["position_m"][done_rows - 1]
+    spliced = jogging.splice(under_way, done_rows, -0.02, LIMITS, TRAVEL_M, DT_S)[0]
+    taken = stage._begin_segment(spliced.setpoints, "in time", at_row=spliced.at_row)
+    stage.pump(0.1)
+    assert stage.status()["segment_number"] == number
+    assert stage.pump(0.1)["segment_number"] == taken
+
+
+def test_a_segment_that_was_asked_for_before_a_stop_is_never_begun_after_it(standing):
+    stage = standing
+    stage.disarm()
+    start = trajectories.MotionState(float(stage.status()["setpoint_position_m"]))
+    stage._begin_segment(jogging.way(start, 0.02, LIMITS, TRAVEL_M, DT_S).setpoints, "too late")
+    stage.pump(0.1)
+    assert stage.enable() is Stop.NONE
+    held_m = float(stage.status()["setpoint_position_m"])
+    for _ in range(10):
+        assert stage.pump()["setpoint_position_m"] == held_m

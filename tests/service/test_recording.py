@@ -16,6 +16,7 @@ from stagectl.retention import KEEP, prune
 from stagectl.ring import RingWriter
 from stagectl.row import new_rows
 from stagectl.run_folder import reserve
+from stagectl.runs import list_runs
 from stagectl.service import messages
 from tests.service.test_stage_loop import Bench
 from tests.small_disk import small_disk
@@ -188,6 +189,8 @@ def test_powered_motion_is_recorded_and_a_fault_while_idle_has_its_last_seconds(
     (motion,) = runs_of(bench, "arm")
     run = read_run(motion)
     assert run.manifest["record"]["state"] == "closed"
+    assert run.manifest["end"]["stop"] == "OPERATOR"
+    assert read_run(home).manifest["end"]["stop"] == "FINISHED"
     assert Phase.TRACKING in run.rows["run_phase"]
     assert "segment" in [event["event"] for event in run.events]
     assert np.all(np.diff(run.rows["cycle"]) == 1)
@@ -231,3 +234,17 @@ def test_a_servo_that_dies_leaves_all_its_rows_in_the_run(bench):
     assert run.rows["t_ns"][-1] == link.rows.read_last(1)["t_ns"][0]
     assert written > run.rows.size
     assert bench.status.fault.kind == "RecordError"
+
+
+def test_a_list_of_runs_need_not_read_what_is_just_recorded(tmp_path):
+    session = flight(tmp_path)
+    session.begin_run("motion", "arm", 0)
+    session.append(rows_from(0, 5000))
+    session.flush()
+    counted = {run.folder.name.split("-")[-1]: run for run in list_runs(tmp_path)}
+    assert (counted["motion"].state, counted["motion"].rows_count) == ("recording", 5000)
+    quick = {run.folder.name.split("-")[-1]: run for run in list_runs(tmp_path, count_under_way=False)}
+    assert (quick["motion"].state, quick["motion"].rows_count) == ("recording", 0)
+    session.close()
+    closed = {run.folder.name.split("-")[-1]: run for run in list_runs(tmp_path, count_under_way=False)}
+    assert (closed["motion"].state, closed["motion"].rows_count) == ("closed", 5000)

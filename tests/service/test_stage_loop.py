@@ -194,6 +194,44 @@ def test_a_lease_that_runs_out_stops_the_stage_and_is_a_fault(armed):
     assert armed.do("arm", messages.Arm()).stop == "FINISHED"
 
 
+def test_an_order_whose_lease_ended_before_it_began_is_refused_and_changes_nothing(armed):
+    key = armed.begin("move", messages.Move(target_m=0.1))
+    held, armed.desk._lease = armed.desk._lease, None
+    armed.loop.step()
+    armed.desk._lease = held
+    armed.loop.step()
+    refused = armed.desk.command(key)
+    assert (refused.state, refused.error.kind) == ("failed", "LeaseRefused")
+    assert armed.do("jog", messages.JogBy(distance_m=0.001)).stop == "FINISHED"
+
+
+def test_a_stop_in_the_last_moment_of_a_jog_is_a_stop(armed):
+    key = armed.desk.jog_at(messages.JogAt(velocity_m_per_s=0.01, hold_s=0.3), armed.token).key
+    order = armed.desk._orders[key]
+    before = order.wanted_m_per_s
+
+    def then_stop():
+        wanted = before()
+        if armed.now_s > 0.0 and wanted is None and armed.loop._stage.status()["segment_left_rows"] <= 0:
+            armed.desk.ask_to_stop("in the last moment")
+            armed.loop._progress("jogging", 0.0)
+        return wanted
+
+    order.wanted_m_per_s = then_stop
+    progress = armed.loop._stage._progress
+
+    def pass_time(what, share):
+        armed.now_s += 0.02
+        progress(what, share)
+
+    armed.loop._stage._progress = pass_time
+    armed.until(lambda: armed.desk.command(key).state == "done")
+    armed.loop._stage._progress = progress
+    armed.until(lambda: not armed.desk.powered and not armed.desk.stop_asked)
+    armed.loop.step()
+    assert (armed.status.state, armed.status.fault) == ("idle", None)
+
+
 def test_a_client_that_vanishes_in_mid_motion_stops_it(armed):
     before = armed.loop._progress
 

@@ -1,0 +1,28 @@
+"""Whether the world that was asked for can be opened now."""
+
+from pathlib import Path
+
+from stagectl.errors import RecordError
+from stagectl.profile import Profile
+from stagectl.ring import RingReader, writer_alive
+from stagectl.stage import present
+
+_SHARED_MEMORY = Path("/dev/shm")
+
+
+def missing(profile: Profile, backend: str, runs_root: Path) -> str:
+    """Say what hardware is not there, or who still has it; empty where all is ready."""
+    if backend != "hardware":
+        return ""
+    absent = [name for name, there in present(profile).items() if not there]
+    if absent:
+        return f"{', '.join(absent)}: not there; plug it in, or ask for another backend"
+    for ring in sorted(_SHARED_MEMORY.glob("stagectl-*.ring")):
+        try:
+            reader = RingReader(ring)
+        except RecordError:
+            continue  # gone meanwhile, or another version's
+        folder = reader.run_folder
+        if folder is not None and runs_root.resolve() in folder.resolve().parents and writer_alive(ring):
+            return f"servo {reader.writer_pid} of the last service still brings the stage to rest"
+    return ""
