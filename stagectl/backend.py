@@ -409,7 +409,7 @@ class RealtimeBackend:
                 "channel": self._channel,
                 "port": self._port,
                 "baud_bit_per_s": profile.interferometer.baud_bit_per_s,
-                "run_folder": str(run_folder.resolve()),
+                "run_folder": str(run_folder.absolute()),  # it may lead elsewhere later
                 "cpu": cpus[-1] if len(cpus) > 1 else None,
                 **{name: str(path) for name, path in paths.items()},
             }

@@ -2,29 +2,21 @@
 
 import io
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import typer.core
 
 from stagectl import commands
+from stagectl.commands.arguments import Json
+from stagectl.commands.arguments import deliver as _deliver
+from stagectl.commands.arguments import epilog as _epilog
+from stagectl.commands.arguments import option as _option
+from stagectl.commands.service_arguments import InPlace, LeaseToken, Socket, service_app
 
 if TYPE_CHECKING:
     from stagectl.commands.answer import Answer, Voice
-
-_EXIT_CODES = (
-    "Exit codes: 0 done; 1 ended early (a stop by guard or drive, or a replay that differs); 2 wrong usage, profile or "
-    "request; 3 link or drive; 4 timing (a step took too long); 5 run folder; 130 Ctrl-C, SIGTERM or a closed terminal "
-    "(stage at rest, run closed)."
-)
-
-
-def _epilog(*examples: str) -> str:
-    """Examples first, each on a line of its own, then the exit codes."""
-    return "\n\n".join([*(f"Example: [cyan]{example}[/]" for example in examples), f"[dim]{_EXIT_CODES}[/]"])
-
 
 app = typer.Typer(
     name="stagectl",
@@ -74,18 +66,14 @@ gap_app = typer.Typer(
 app.add_typer(profile_app, name="profile")
 app.add_typer(runs_app, name="runs")
 app.add_typer(gap_app, name="gap")
+app.add_typer(service_app)
 
 
 # ---- what can be asked: each option once --------------------------------------------------------------------------
 
 
-def _option(help: str, *names: str, metavar: str | None = None, **more: Any) -> Any:
-    return typer.Option(*names, help=help, metavar=metavar, **more)
-
-
 _AUTO = "auto takes the rig only where neither the profile's CAN interface nor its serial port exists, and says so"
 
-Json = Annotated[bool, _option("One JSON object on stdout and nothing else; progress on stderr.", "--json")]
 Profile = Annotated[
     str, _option("Profile: a name or a TOML file.", "--profile", "-p", metavar="NAME", envvar="STAGECTL_PROFILE")
 ]
@@ -114,7 +102,10 @@ Duration = Annotated[float | None, _option("sine: whole time, ramps included.")]
 Target = Annotated[float | None, _option("move: where to, from the homed zero.")]
 SweepFrequency = Annotated[float, _option("Frequency of the sweep over both edges.", min=0.05, max=5.0)]
 SweepDuration = Annotated[float, _option("How long to sweep.", min=2.0, max=240.0)]
-Distance = Annotated[float, _option("How far, signed.", "--distance-m")]
+Distance = Annotated[float | None, _option("How far, signed.", "--distance-m")]
+Keys = Annotated[bool, _option("Hold an arrow key to move; through a service only.", "--keys")]
+JogSpeed = Annotated[float, _option("Speed of --keys.", "--velocity-m-per-s", min=1e-6, max=20.0)]
+MoveTarget = Annotated[float, _option("Where to, from the homed zero.", "--target-m")]
 ExportFormat = Annotated[str, _option("csv | parquet | mat.", "--format", "-f", metavar="FORMAT")]
 Columns = Annotated[str | None, _option("Fields to take, with commas between (default: all).", metavar="A,B,...")]
 ExportFile = Annotated[
@@ -201,12 +192,6 @@ Version = Annotated[bool, _option("Print the version.", "--version", callback=_v
 # ---- the commands -------------------------------------------------------------------------------------------------
 
 
-def _deliver(command: str, as_json: bool, work: "Callable[[Voice], Answer]") -> NoReturn:
-    from stagectl.commands.answer import deliver
-
-    deliver(command, as_json, work)
-
-
 @app.callback()
 def _root(version: Version = False) -> None:
     """Servo controller for macro-micro stages."""
@@ -263,36 +248,100 @@ def identify(
     backend: WireOrPlant = "auto",
     seed: Seed = 1,
     runs: Runs = _RUNS,
+    lease: LeaseToken = None,
+    socket: Socket = None,
+    in_place: InPlace = False,
     json: Json = False,
 ) -> None:
     """Identify the backlash: the micro sweeps over both edges of the joint, pressing with a few newtons."""
-    _deliver(
-        "identify",
-        json,
-        lambda voice: commands.motion.identify(voice, profile, backend, runs, seed, frequency_hz, duration_s),
-    )
+
+    def work(voice: "Voice") -> "Answer":
+        if backend != "plant" and commands.remote.served(socket, in_place):
+            body = commands.remote.checked("Identify", frequency_hz=frequency_hz, duration_s=duration_s)
+            return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "identify", body)
+        return commands.motion.identify(voice, profile, backend, runs, seed, frequency_hz, duration_s)
+
+    _deliver("identify", json, work)
 
 
-@app.command(epilog=_epilog("stagectl jog --distance-m 0.01", "stagectl jog --distance-m -0.01 --law pid"))
+@app.command(
+    epilog=_epilog("stagectl jog --distance-m 0.01", "stagectl jog --distance-m -0.01 --law pid", "stagectl jog --keys")
+)
 def jog(
-    distance_m: Distance,
+    context: typer.Context,
+    distance_m: Distance = None,
+    keys: Keys = False,
+    velocity_m_per_s: JogSpeed = 0.01,
     law: Law = None,
     profile: Profile = _PROFILE,
     backend: Wire = "auto",
     seed: Seed = 1,
     runs: Runs = _RUNS,
+    lease: LeaseToken = None,
+    socket: Socket = None,
+    in_place: InPlace = False,
     json: Json = False,
 ) -> None:
-    """Arm, home, move by a distance, come to rest."""
-    _deliver("jog", json, lambda voice: commands.motion.jog(voice, profile, backend, runs, seed, distance_m, law))
+    """Arm, home where needed, move by a distance or while a key is held, come to rest."""
+    if (distance_m is None) is not keys:
+        raise typer.BadParameter("give --distance-m, or --keys", ctx=context)
+
+    def work(voice: "Voice") -> "Answer":
+        if distance_m is None:
+            return commands.jog_keys.jog(voice, socket, lease, velocity_m_per_s)
+        if commands.remote.served(socket, in_place):
+            body = commands.remote.checked("JogBy", distance_m=distance_m, law=law)
+            return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "jog", body)
+        return commands.motion.jog(voice, profile, backend, runs, seed, distance_m, law)
+
+    _deliver("jog", json, work)
+
+
+@app.command(epilog=_epilog("stagectl move --target-m 0.05"))
+def move(
+    target_m: MoveTarget,
+    law: Law = None,
+    profile: Profile = _PROFILE,
+    backend: Wire = "auto",
+    seed: Seed = 1,
+    runs: Runs = _RUNS,
+    lease: LeaseToken = None,
+    socket: Socket = None,
+    in_place: InPlace = False,
+    json: Json = False,
+) -> None:
+    """Arm, home where needed, move to a position, come to rest."""
+
+    def work(voice: "Voice") -> "Answer":
+        if commands.remote.served(socket, in_place):
+            body = commands.remote.checked("Move", target_m=target_m, law=law)
+            return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "move", body)
+        shape = commands.planning.Shape(None, None, None, None, None, None, None, target_m)
+        return commands.motion.run(voice, profile, backend, runs, seed, "move", shape, law)
+
+    _deliver("move", json, work)
 
 
 @app.command(epilog=_epilog("stagectl home"))
 def home(
-    profile: Profile = _PROFILE, backend: Wire = "auto", seed: Seed = 1, runs: Runs = _RUNS, json: Json = False
+    profile: Profile = _PROFILE,
+    backend: Wire = "auto",
+    seed: Seed = 1,
+    runs: Runs = _RUNS,
+    lease: LeaseToken = None,
+    socket: Socket = None,
+    in_place: InPlace = False,
+    json: Json = False,
 ) -> None:
     """Home: the macro on its drive's index, then the micro on both edges of the joint."""
-    _deliver("home", json, lambda voice: commands.motion.home(voice, profile, backend, runs, seed))
+
+    def work(voice: "Voice") -> "Answer":
+        if commands.remote.served(socket, in_place):
+            body = commands.remote.checked("Home")
+            return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "home", body)
+        return commands.motion.home(voice, profile, backend, runs, seed)
+
+    _deliver("home", json, work)
 
 
 @app.command(epilog=_epilog("stagectl replay latest"))

@@ -267,6 +267,16 @@ class Air(Table):
     co2_ppm: Annotated[float, within(0.0, 2000.0)] = 450.0
 
 
+class Record(Table):
+    """What the service keeps of a session, and what it does where the disk takes no more."""
+
+    when: Literal["armed", "always"] = "armed"
+    flight_s: Annotated[float, within(1.0, 600.0)] = 30.0
+    on_full_disk: Literal["stop", "go_on"] = "stop"
+    size_limit_bytes: Annotated[int, whole(10**6, 10**15)] = 100_000_000_000
+    age_limit_s: Annotated[float, within(60.0, 1e10)] = 30 * 86400.0
+
+
 class Control(Table):
     """Which law, how fast, and how large an error may be; ratios count in 2 pi times the bandwidth."""
 
@@ -321,6 +331,7 @@ class Profile(Document):
     interferometer: Interferometer
     air: Air
     control: Control
+    record: Record = Record()
     effect_files: tuple[EffectFile, ...] = ()  # before the effects that they declare
     effects: tuple[EffectTable, ...] = ()
 

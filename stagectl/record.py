@@ -147,6 +147,11 @@ class Recorder:
             ) from error
         self._log = _structured_log(self._put_event)
 
+    @property
+    def recovery_folder(self) -> Path:
+        """Where rows go that a dead servo left: the run itself."""
+        return self.folder
+
     def append(self, rows: np.ndarray) -> None:
         """Take over rows, shape (n,) of ROW; they are in the file within 0.25 s of their time. Errors: RecordError."""
         if rows.dtype != ROW:

@@ -52,6 +52,7 @@ REQUEST = np.dtype(
         ("segment_number", "i8"),  # a change starts the segment
         ("segment_start", "i8"),  # its first row in the segment table
         ("segment_rows", "i8"),
+        ("segment_at_row", "i8"),  # it goes on within the segment under way, behind that many rows; 0 = at once
         ("lease_until_t_ns", "i8"),
         ("acknowledge_number", "i8"),
         ("update_number", "i8"),  # a change takes over zeros and belief

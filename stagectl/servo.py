@@ -155,6 +155,7 @@ class Servo:
         self._segment_row = 0
         self._segment_start = 0
         self._segment_rows = 0
+        self._late_segment_number = 0
         self._update_number = 0
         self._acknowledged = 0
         self._counter = -1
@@ -404,7 +405,9 @@ class Servo:
             if macro_state is on and micro_on and seen.samples_new > 0:
                 self.tracker.begin(self._asked.law_number)
                 self._last_cycle = seen.cycle
-                self._segment_row = self._segment_rows  # a segment that a stop cut short is never taken up again
+                # What a stop cut short, or what was asked for and not begun before it, is never taken up again.
+                self._segment_number = self._asked.segment_number
+                self._segment_row = self._segment_rows
                 self._enter(Phase.TRACKING, t_ns)
             elif in_phase_s > _ENABLE_TIMEOUT_S or self._failed_drive():
                 stop, text = self._not_enabled()
@@ -542,14 +545,8 @@ class Servo:
             self._follow_macro()
         else:
             number = asked.segment_number
-            if number != self._segment_number:
-                self._segment_number = number
-                self._segment_start = asked.segment_start
-                self._segment_rows = asked.segment_rows
-                self._segment_row = 0
-                if asked.law_number != self.tracker.law_number:
-                    self.tracker.switch(asked.law_number)
-                passed = max(passed, 1)
+            if number != self._segment_number and number != self._late_segment_number:
+                passed = self._begin_segment(number, passed)
             if self._segment_row < self._segment_rows and passed:
                 self._segment_row = min(self._segment_row + passed, self._segment_rows)
                 start = (self._segment_start + self._segment_row - 1) * SETPOINT.itemsize
@@ -557,6 +554,31 @@ class Servo:
                 if self._segment_row == self._segment_rows:
                     self._rest(hold)
         self._setpoint_bytes[:] = self._hold_bytes
+
+    def _begin_segment(self, number: int, passed: int) -> int:
+        """Take a new segment; returns the rows to advance by.
+
+        One that goes on within the segment under way is taken at its row, and never where that is past: what is
+        under way ends at rest by itself, and a step in the reference would be a blow.
+        """
+        asked = self._asked
+        if asked.segment_at_row > 0:
+            if self._segment_row > asked.segment_at_row:
+                self._late_segment_number = number
+                return passed
+            ahead = self._segment_row + passed - asked.segment_at_row
+            if ahead <= 0:
+                return passed
+            passed = ahead
+        else:
+            passed = max(passed, 1)
+        self._segment_number = number
+        self._segment_start = asked.segment_start
+        self._segment_rows = asked.segment_rows
+        self._segment_row = 0
+        if asked.law_number != self.tracker.law_number:
+            self.tracker.switch(asked.law_number)
+        return passed
 
     @staticmethod
     def _rest(hold: np.ndarray) -> None:

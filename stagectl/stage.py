@@ -59,9 +59,11 @@ def open_stage(
     machine: str | Path | None = None,
     progress: Progress = lambda what, share: None,
     manifest: dict[str, Any] | None = None,
+    **watching: Any,
 ) -> Supervisor:
     """Open the world and return its supervisor; entering that configures the drives and starts the servo.
 
+    `watching` goes to the supervisor: `lease_left_s`, `observe`, `record`.
     Makes the run's folder: whoever leaves it empty gives it back (`run_folder.give_back`).
     """
     chosen = choose(profile, backend)
@@ -86,4 +88,4 @@ def open_stage(
     except BaseException:
         world.close()
         raise
-    return Supervisor(profile, world, folder, progress, facts)
+    return Supervisor(profile, world, folder, progress, facts, **watching)

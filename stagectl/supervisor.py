@@ -16,9 +16,11 @@ import numpy as np
 from drivers import cia402
 from drivers.arming import DriveMapping, DriveSettings, StaleTorque, configure
 from drivers.canopen_master import Master
+from stagectl import jogging
 from stagectl import trajectory as trajectories
 from stagectl.backend import SEGMENT_ROWS, Backend, ServoLink
 from stagectl.errors import DriveError, LinkError, RecordError, RequestError, StagectlError, TimingError
+from stagectl.flight_recorder import FlightRecorder
 from stagectl.plant import PLANT_PARAMETERS
 from stagectl.profile import AxisName, Profile
 from stagectl.record import Recorder
@@ -43,7 +45,9 @@ _SENSOR_TIMEOUT_S = 5.0
 _INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
 _TOUCH_TRIES = 4
 _JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
-_PLAN_SHARE = 0.9  # of the profile's limits that planned moves use
+PLAN_SHARE = 0.9
+"""Of the profile's limits that planned moves use."""
+
 _JERK_TIME_S = 0.1
 _QUICK_STOP_HOLD, _QUICK_STOP_OFF = 6, 2
 _STALE_SHARE = 1.0 / 3.0  # of the micro's way to a stop that each drive may use up before it misses a dead servo
@@ -160,14 +164,22 @@ class Supervisor:
         run_folder: Path,
         progress: Progress = lambda what, share: None,
         manifest: dict[str, Any] | None = None,
+        *,
+        lease_left_s: Callable[[], float] = lambda: math.inf,
+        observe: Callable[[np.ndarray], None] = lambda rows: None,
+        record: Callable[[Path, dict[str, Any]], Recorder | FlightRecorder] = Recorder,
     ):
-        """Hold the parts; nothing is touched before `connect`."""
+        """Hold the parts; nothing is touched before `connect`.
+
+        The servo's lease lasts as long as `lease_left_s` says, `trip.lease_s` at most. `observe` sees every row once.
+        """
         self.profile, self.backend, self.folder = profile, backend, run_folder
         self._progress = progress
         self._manifest = dict(manifest or {})
+        self._lease_left_s, self._observe, self._record = lease_left_s, observe, record
         self._master: Master | None = None
         self._link: ServoLink | None = None
-        self._recorder: Recorder | None = None
+        self._recorder: Recorder | FlightRecorder | None = None
         self._counter = 0
         self._segment_number = 0
         self._segment_free = 0
@@ -176,6 +188,7 @@ class Supervisor:
         self._belief = np.zeros(1, PLANT_PARAMETERS)
         self._holds_lease = False
         self._watches = False
+        self._asked_to_stop = False
         self._heartbeats_missed: dict[str, int] = {}
         self._heartbeat_ages_s: dict[str, float] = {}
         self._reason = ""  # why this side asked the servo to stop
@@ -212,7 +225,7 @@ class Supervisor:
         return self._master
 
     @property
-    def recorder(self) -> Recorder:
+    def recorder(self) -> Recorder | FlightRecorder:
         """The run's recorder; RequestError before `connect`."""
         if self._recorder is None:
             raise RequestError("the stage is not connected; call connect() first")
@@ -243,12 +256,15 @@ class Supervisor:
         """
         link = self.link
         self._counter += 1
-        lease_ns = round(self.profile.trip.lease_s * 1e9) if self._holds_lease else 0
+        lease_s = min(self.profile.trip.lease_s, self._lease_left_s()) if self._holds_lease else 0.0
+        lease_ns = round(max(lease_s, 0.0) * 1e9)
         link.requests.publish({"counter": self._counter, "lease_until_t_ns": link.now_t_ns() + lease_ns})
         link.pass_time(duration_s)
         with undisturbed():  # rows that left the ring must reach the recorder
             try:
-                self.recorder.append(link.rows.read_new())
+                rows = link.rows.read_new()
+                self._observe(rows)
+                self.recorder.append(rows)
             except RecordError as error:
                 self._distress(Stop.RECORD_LOST, str(error), error)
         if self._watches:
@@ -346,8 +362,8 @@ class Supervisor:
             "mappings": {axis: describe_mapping(mapping) for axis, mapping in self.mappings.items()},
             "laws": list(LAW_NAMES),
         }
-        self._recorder = Recorder(self.folder, manifest)
-        self._link = self.backend.start_servo(profile, self.mappings, self.folder)
+        self._recorder = self._record(self.folder, manifest)
+        self._link = self.backend.start_servo(profile, self.mappings, self._recorder.recovery_folder)
         self._belief[...] = self._link.tracker_belief
         self._recorder.save_snapshot(self._link.snapshot)
         master.nmt(0, "start")
@@ -426,6 +442,8 @@ class Supervisor:
         """Enable both drives and hold where the stage is; returns why not, NONE when it holds."""
         if self.status()["phase"] == Phase.TRACKING:
             return Stop.NONE
+        if self._asked_to_stop:
+            return Stop.OPERATOR
         if self._heartless():
             return Stop.HEARTBEAT_LOST
         self._holds_lease = True
@@ -444,6 +462,19 @@ class Supervisor:
         if stop is Stop.HEARTBEAT_LOST:  # refused: the servo did not even hear of it
             return Outcome("enable", stop, first_row, 0, detail=self._heartbeat_detail())
         return self._outcome("enable", Stop.FINISHED if stop is Stop.NONE else stop, first_row)
+
+    def ask_to_stop(self) -> None:
+        """Have the motion under way come to rest; nothing is enabled or homed before `allow_motion`.
+
+        To be called between two steps of a motion, from `progress` say; the motion ends with OPERATOR.
+        """
+        self._asked_to_stop = True
+        if self.status()["phase"] not in RESTING:
+            self._request(mode=int(Mode.STOP), stop=int(Stop.NONE))
+
+    def allow_motion(self) -> None:
+        """Take back `ask_to_stop`; moves and enables nothing."""
+        self._asked_to_stop = False
 
     def disarm(self) -> Stop:
         """Bring the stage to rest under the law, then take the power away."""
@@ -529,7 +560,7 @@ class Supervisor:
             if not quiet:
                 raise
 
-    def _end_run(self, link: ServoLink, recorder: Recorder, end: dict[str, Any]) -> None:
+    def _end_run(self, link: ServoLink, recorder: Recorder | FlightRecorder, end: dict[str, Any]) -> None:
         """End the servo, which first stops what moves, and put its last rows on the disk."""
         with undisturbed():
             self._link = None
@@ -623,6 +654,8 @@ class Supervisor:
         master.write(node, cia402.HOMING_SPEEDS, 1, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_SPEEDS, 2, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_ACCELERATION, 0, round(homing.acceleration_m_per_s2 / step_m))
+        if self._asked_to_stop:
+            return Stop.OPERATOR
         self._holds_lease = True
         self.pump()
         self._request(mode=int(Mode.HOME_DRIVE))
@@ -684,19 +717,8 @@ class Supervisor:
         away_m = abs(float(setpoints["position_m"][0]) - float(status["setpoint_position_m"]))
         if not away_m <= 1e-6:
             raise RequestError(f"{name} begins {away_m:g} m from where the stage holds; move there first")
-        if self._segment_free + setpoints.size > SEGMENT_ROWS:
-            self._segment_free = 0
-        start = self._segment_free
-        self.link.segments[start : start + setpoints.size] = setpoints
-        self._segment_free += setpoints.size
-        self._segment_number += 1
-        number = self._segment_number
         first_row = self.recorder.rows_count
-        fields: dict[str, Any] = {"segment_start": start, "segment_rows": setpoints.size, "segment_number": number}
-        if law is not None:
-            fields["law_number"] = LAW_NAMES.index(law)
-        self._event("segment", number=number, segment=name, law=law, setpoints=int(setpoints.size))
-        self._request(**fields)
+        number = self._begin_segment(setpoints, name, law)
         duration_s = setpoints.size / self.profile.cycle.rate_hz
         until_t_ns = self.link.now_t_ns() + round((duration_s * 1.5 + 5.0) * 1e9)
         while True:
@@ -717,6 +739,27 @@ class Supervisor:
         self._event("segment_end", number=number, stop=stop.name, **({"detail": detail} if detail else {}))
         return self._outcome(name, stop, first_row, self._backlash(status))
 
+    def _begin_segment(self, setpoints: np.ndarray, name: str, law: str | None = None, at_row: int = 0) -> int:
+        """Have the servo follow a segment, behind `at_row` rows of the one under way; returns its number."""
+        if self._segment_free + setpoints.size > SEGMENT_ROWS:
+            self._segment_free = 0
+        start = self._segment_free
+        self.link.segments[start : start + setpoints.size] = setpoints
+        self._segment_free += setpoints.size
+        self._segment_number += 1
+        number = self._segment_number
+        fields: dict[str, Any] = {
+            "segment_start": start,
+            "segment_rows": setpoints.size,
+            "segment_number": number,
+            "segment_at_row": at_row,
+        }
+        if law is not None:
+            fields["law_number"] = LAW_NAMES.index(law)
+        self._event("segment", number=number, segment=name, law=law, setpoints=int(setpoints.size))
+        self._request(**fields)
+        return number
+
     def _backlash(self, status: np.void) -> BacklashEstimate | None:
         if self.profile.micro is None:
             return None
@@ -726,10 +769,8 @@ class Supervisor:
 
     def _limits(self) -> trajectories.Limits:
         macro = self.profile.macro
-        acceleration = _PLAN_SHARE * min(macro.acceleration_limit_m_per_s2, 0.5 * macro.stop_deceleration_m_per_s2)
-        return trajectories.Limits(
-            _PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S
-        )
+        acceleration = PLAN_SHARE * min(macro.acceleration_limit_m_per_s2, 0.5 * macro.stop_deceleration_m_per_s2)
+        return trajectories.Limits(PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S)
 
     def move(self, target_m: float, law: str | None = None) -> Outcome:
         """Move the end to a position, jerk-limited; checked before the first cycle."""
@@ -741,6 +782,63 @@ class Supervisor:
         planned = trajectories.move(start_m, target_m, self._limits(), 1.0 / self.profile.cycle.rate_hz)
         self._check(planned)
         return self.follow(planned.setpoints, f"moving to {target_m * 1e3:g} mm", law)
+
+    def jog(self, wanted_m_per_s: Callable[[], float | None]) -> Outcome:
+        """Move at the velocity that is wanted now, asked for every 20 ms, until that is None; then come to rest.
+
+        Every plan under way ends at rest, at the ends of travel or within `jogging.HORIZON_S`.
+        """
+        name, first_row = "jogging", self.recorder.rows_count
+        limits, travel_m, dt_s = self._limits(), self.profile.macro.travel_m, 1.0 / self.profile.cycle.rate_hz
+        self._centre(self.status())
+        under_way, number, speed = np.zeros(0, SETPOINT), self._segment_number, 0.0
+        pending: tuple[int, jogging.Splice, float] | None = None
+        while True:
+            status = self.pump()
+            if status["phase"] != Phase.TRACKING:
+                status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "coming to rest")
+                return self._outcome(name, Stop(int(status["stop"])), first_row)
+            self._progress(name, 0.0)
+            asked = wanted_m_per_s()
+            wanted = 0.0 if asked is None else jogging.wanted_speed(asked, limits)
+            if pending is not None and status["segment_number"] == pending[0]:
+                (number, (_, under_way), speed), pending = pending, None
+            if status["segment_number"] != number:  # not begun yet
+                continue
+            left_rows = max(int(status["segment_left_rows"]), 0)
+            done_rows = under_way.size - left_rows
+            if pending is not None:
+                if done_rows <= pending[1].at_row:
+                    continue
+                pending = None  # it came too late: once more
+            if left_rows == 0:
+                if asked is None:
+                    return self._outcome(name, Stop.FINISHED, first_row)
+                start = trajectories.MotionState(float(status["setpoint_position_m"]))
+                if wanted == 0.0 or self._at_end(start.position_m, wanted):
+                    continue
+                planned = jogging.way(start, wanted, limits, travel_m, dt_s)
+                self._check(planned)
+                under_way, speed = planned.setpoints, wanted
+                number = self._begin_segment(under_way, name)
+            elif wanted != speed or self._nears_end(under_way, left_rows * dt_s, wanted):
+                spliced = jogging.splice(under_way, done_rows, wanted, limits, travel_m, dt_s)
+                if spliced is None:
+                    continue
+                self._check(spliced[1])
+                splice = spliced[0]
+                pending = self._begin_segment(splice.setpoints, name, at_row=splice.at_row), splice, wanted
+
+    def _nears_end(self, under_way: np.ndarray, left_s: float, velocity_m_per_s: float) -> bool:
+        """Tell whether a jog has used up half of its plan, and there is way left beyond it."""
+        if velocity_m_per_s == 0.0 or left_s >= 0.5 * jogging.HORIZON_S:
+            return False
+        return not self._at_end(float(under_way["position_m"][-1]), velocity_m_per_s)
+
+    def _at_end(self, position_m: float, velocity_m_per_s: float) -> bool:
+        """Tell whether there is no way left in that direction."""
+        low_m, high_m = self.profile.macro.travel_m
+        return position_m >= high_m - 1e-6 if velocity_m_per_s > 0.0 else position_m <= low_m + 1e-6
 
     def _check(self, planned: trajectories.Trajectory) -> None:
         macro = self.profile.macro

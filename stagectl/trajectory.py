@@ -181,29 +181,9 @@ def trapezoid(
 def move(start: float | MotionState, target_m: float, limits: Limits, dt_s: float = 1e-3) -> Trajectory:
     """Fastest jerk-limited move from `start` (a position at rest, or a state) to rest at `target_m`."""
     state = start if isinstance(start, MotionState) else MotionState(start)
-    planned = ruckig.InputParameter(1)
-    planned.current_position = [_finite("start position_m", state.position_m)]
-    planned.current_velocity = [_finite("start velocity_m_per_s", state.velocity_m_per_s)]
-    planned.current_acceleration = [_finite("start acceleration_m_per_s2", state.acceleration_m_per_s2)]
+    planned = _planned_from(state, limits)
     planned.target_position = [_finite("target_m", target_m)]
-    planned.max_velocity = [_positive("limits.velocity_m_per_s", limits.velocity_m_per_s)]
-    planned.max_acceleration = [_positive("limits.acceleration_m_per_s2", limits.acceleration_m_per_s2)]
-    planned.max_jerk = [_positive("limits.jerk_m_per_s3", limits.jerk_m_per_s3)]
-    plan = ruckig.Trajectory(1)
-    try:
-        result = ruckig.Ruckig(1).calculate(planned, plan)
-    except ruckig.RuckigError as error:
-        raise RequestError(
-            f"no move from {state} to {target_m} m within {limits}: {error}; widen the limits"
-        ) from error
-    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise RequestError(f"no move from {state} to {target_m} m within {limits}: {result}; widen the limits")
-    knots_s, states = _planned_phases(plan, target_m)
-    t_s = _grid(max(float(knots_s[-1]), dt_s), dt_s)
-    setpoints = _table(t_s.size)
-    for column, values in zip(_COLUMNS, _evaluate(knots_s, states, t_s), strict=True):
-        setpoints[column] = values
-    _end_at_rest(setpoints, target_m)
+    setpoints = _calculated(planned, f"no move from {state} to {target_m} m within {limits}", dt_s, target_m)
     parameters = {
         "kind": "move",
         "start_position_m": state.position_m,
@@ -216,6 +196,53 @@ def move(start: float | MotionState, target_m: float, limits: Limits, dt_s: floa
         "dt_s": dt_s,
     }
     return Trajectory("move", parameters, dt_s, setpoints)
+
+
+def brake(start: MotionState, limits: Limits, dt_s: float = 1e-3) -> Trajectory:
+    """Fastest jerk-limited way from a state to rest, wherever that ends."""
+    planned = _planned_from(start, limits)
+    planned.control_interface = ruckig.ControlInterface.Velocity
+    setpoints = _calculated(planned, f"no way from {start} to rest within {limits}", dt_s)
+    parameters = {
+        "kind": "brake",
+        "start_position_m": start.position_m,
+        "start_velocity_m_per_s": start.velocity_m_per_s,
+        "start_acceleration_m_per_s2": start.acceleration_m_per_s2,
+        "acceleration_m_per_s2": limits.acceleration_m_per_s2,
+        "jerk_m_per_s3": limits.jerk_m_per_s3,
+        "dt_s": dt_s,
+    }
+    return Trajectory("brake", parameters, dt_s, setpoints)
+
+
+def _planned_from(state: MotionState, limits: Limits) -> ruckig.InputParameter:
+    planned = ruckig.InputParameter(1)
+    planned.current_position = [_finite("start position_m", state.position_m)]
+    planned.current_velocity = [_finite("start velocity_m_per_s", state.velocity_m_per_s)]
+    planned.current_acceleration = [_finite("start acceleration_m_per_s2", state.acceleration_m_per_s2)]
+    planned.max_velocity = [_positive("limits.velocity_m_per_s", limits.velocity_m_per_s)]
+    planned.max_acceleration = [_positive("limits.acceleration_m_per_s2", limits.acceleration_m_per_s2)]
+    planned.max_jerk = [_positive("limits.jerk_m_per_s3", limits.jerk_m_per_s3)]
+    return planned
+
+
+def _calculated(planned: ruckig.InputParameter, refusal: str, dt_s: float, target_m: float | None = None) -> np.ndarray:
+    """Return the setpoints of a plan that ends at rest, at `target_m` or where braking ends."""
+    plan = ruckig.Trajectory(1)
+    try:
+        result = ruckig.Ruckig(1).calculate(planned, plan)
+    except ruckig.RuckigError as error:
+        raise RequestError(f"{refusal}: {error}; widen the limits") from error
+    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise RequestError(f"{refusal}: {result}; widen the limits")
+    end_m = float(plan.at_time(plan.duration)[0][0]) if target_m is None else target_m
+    knots_s, states = _planned_phases(plan, end_m)
+    t_s = _grid(max(float(knots_s[-1]), dt_s), dt_s)
+    setpoints = _table(t_s.size)
+    for column, values in zip(_COLUMNS, _evaluate(knots_s, states, t_s), strict=True):
+        setpoints[column] = values
+    _end_at_rest(setpoints, end_m)
+    return setpoints
 
 
 def from_table(t_s: np.ndarray, position_m: np.ndarray, dt_s: float = 1e-3, name: str = "table") -> Trajectory:

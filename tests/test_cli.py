@@ -55,6 +55,16 @@ COMMANDS = [
     ["runs", "export"],
     ["runs", "import"],
     ["runs", "plot"],
+    ["serve"],
+    ["status"],
+    ["watch"],
+    ["move"],
+    ["stop"],
+    ["fault"],
+    ["lease"],
+    ["backend"],
+    ["record"],
+    ["log"],
     ["gap"],
     ["gap", "search"],
     ["gap", "apply"],
@@ -122,7 +132,9 @@ def test_what_is_no_command_of_gap_is_a_search(capsys):
 
 
 def test_help_loads_nothing_heavy():
-    heavy = "numba, numpy, matplotlib, pyarrow, scipy, can, canopen, pydantic, ruckig, structlog"
+    heavy = (
+        "numba, numpy, matplotlib, pyarrow, scipy, can, canopen, pydantic, ruckig, structlog, httpx, fastapi, uvicorn"
+    )
     code = (
         f"import sys; from stagectl import cli; cli.main(['--help']); print({heavy!r}.split(', ') & sys.modules.keys())"
     )

@@ -90,7 +90,7 @@ def test_linear_where_it_says_so(name):
 def test_amplitudes_are_linear_but_where_the_law_is_not():
     assert {name for name, known in CATALOGUE.items() if not known.linear} == {
         *("soft_contact", "force_constant_saturation", "amplifier_dead_band", "current_loop_lag", "command_delay"),
-        *("sensor_delay", "sensor_lag", "flexible_mode"),
+        *("sensor_delay", "sensor_lag", "clock_skew", "flexible_mode", "contact_damping"),
     }
 
 

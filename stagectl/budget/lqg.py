@@ -327,10 +327,10 @@ def optimum(around: Surroundings, max_sensitivity: float = 2.0, step_peak_m_per_
             raise
         found = stiffest(around, max_sensitivity)
     if not found.step_peak_m(1.0) <= step_peak_m_per_n * _LIMIT_SLACK:
+        least_m = stiffest(around, max_sensitivity).step_peak_m(1.0)
         raise RequestError(
             f"a step of 1 N is to move the end by {step_peak_m_per_n * 1e9:.3g} nm at most; with a greatest "
-            f"sensitivity of {max_sensitivity:g} it moves it by {stiffest(around, max_sensitivity).step_peak_m(1.0) * 1e9:.3g} nm "
-            "at least: allow more of either"
+            f"sensitivity of {max_sensitivity:g} it moves it by {least_m * 1e9:.3g} nm at least: allow more of either"
         )
     return found.hold()
 

@@ -23,16 +23,20 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "__all__",
     "budget",
     "demo",
     "gap",
     "gap_demo",
     "gap_next",
+    "jog_keys",
     "motion",
     "planning",
     "profiles",
+    "remote",
     "reproduce",
     "runs",
+    "serve",
     "tune",
 ]
 

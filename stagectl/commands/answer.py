@@ -47,6 +47,10 @@ class Voice:
     run_folder: Path | None = field(default=None)
     whole_file: Path | None = field(default=None)  # a result that is there whatever comes after
 
+    def check(self) -> None:
+        """Let an interrupt come out that was asked for."""
+        self.progress.check()
+
     def note(self, text: str) -> None:
         """Say a sentence on stderr."""
         self.console.print(text, style="dim", highlight=False, markup=False, soft_wrap=True)
@@ -71,12 +75,16 @@ def jsonable(value: Any) -> Any:
     return str(value)
 
 
-def deliver(command: str, as_json: bool, work: Callable[[Voice], Answer]) -> NoReturn:
-    """Do the work and end the command: prints the answer or the error, raises typer.Exit with the exit code."""
+def deliver(command: str, as_json: bool, work: Callable[[Voice], Answer], compiles: bool = True) -> NoReturn:
+    """Do the work and end the command: prints the answer or the error, raises typer.Exit with the exit code.
+
+    `compiles`: whether it may run compiled code in this process; where that is kept is looked at first then.
+    """
     console = Console(stderr=True)
     interruption = Interruption()
     voice = Voice(console, LiveProgress(console, interruption.check), interruption.hush)
-    _say_where_compiled_code_goes(voice)
+    if compiles:
+        _say_where_compiled_code_goes(voice)
     try:
         with interruption, voice.progress:
             answer = work(voice)

@@ -16,7 +16,7 @@ class LiveProgress:
 
     def __init__(self, console: Console, check: Callable[[], None]):
         """`check` is called with every report: the place where an interrupt may come out."""
-        self._console, self._check = console, check
+        self._console, self.check = console, check
         self._what = ""
         self._began_s = 0.0
         self._task: TaskID | None = None
@@ -42,7 +42,7 @@ class LiveProgress:
 
     def __call__(self, what: str, share: float) -> None:
         """Report that `what` is under way; share 0 where nobody knows how far."""
-        self._check()
+        self.check()
         with contextlib.suppress(OSError):  # a terminal that is just being closed must not end what moves
             self._show(what, share)
 

@@ -12,7 +12,7 @@ from stagectl.effects.declaration import Trait, effect
 @effect(
     places=("contact",),
     damping_n_s_per_m=(0.0, 1e5),
-    linear=("damping_n_s_per_m",),
+    searched=("damping_n_s_per_m",),  # not linear: it decides where a contact lets go
     shown_by="contact",
     symptom="proportional to the speed of the joint, in contact only",
     reference="Kelvin-Voigt contact; Kang et al. 2023, section 6.1",

@@ -83,7 +83,7 @@ class Trait(StrEnum):
 
     BASE = "base"  # what the base does: felt by everything that stands on it
     KNOWN_PARAMETER = "known parameter"  # says the same as a parameter of the machine that is wrong
-    TIME_SHIFT = "time shift"  # a reading of another instant: so late as a velocity of one makes it read less
+    TIME_SHIFT = "time shift"  # readings of instants that are further and further off: more than a Taylor series holds
     LATE_READING = "late reading"  # a reading of an earlier instant: two such laws differ in what rounds the motion
     FIRST_ORDER = "first order"  # moves a reading by so little that no force feels it
 

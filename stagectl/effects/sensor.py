@@ -11,7 +11,7 @@ _PHASE = (-7.0, 7.0)  # rad
 @effect(
     places=_SENSORS,
     delay_s=(-0.01, 0.01),
-    traits=(Trait.LATE_READING, Trait.TIME_SHIFT),
+    traits=(Trait.LATE_READING,),
     searched=("delay_s",),
     shown_by="acceleration",
     symptom="proportional to velocity, on the reading",

@@ -48,6 +48,7 @@ def grids_for(recordings: Sequence[Recording]) -> Grid:
             {"slip_m": s, "exponent_ratio": p} for s in (2e-3, 6e-3, 2e-2, 6e-2) for p in (0.0, 0.999)
         ],
         "cable_spring": [{"anchor_m": centre_m}],
+        "contact_damping": [{"damping_n_s_per_m": d} for d in (30.0, 150.0, 600.0)],
         "contact_hysteresis": smooth[::2],
         "soft_contact": [{"knee_m": k} for k in (3e-6, 1e-5, 3e-5, 6e-5)],
         "force_constant_saturation": [{"saturation_n": s} for s in (150.0, 400.0, 1000.0, 3000.0)],

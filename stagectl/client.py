@@ -1,0 +1,248 @@
+"""A stage's service from another program, with types: `with Client() as stage: with stage.lease("me"): stage.home()`.
+
+Talks over the Unix socket, or over TCP with a token. Imports neither numpy nor the stage. Errors: RequestError where
+the service refuses, with its text; LinkError where it doesn't answer.
+"""
+
+import contextlib
+import secrets
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx
+from pydantic import BaseModel, TypeAdapter
+
+from stagectl.errors import DriveError, LinkError, ProfileError, RecordError, RequestError, StagectlError, TimingError
+from stagectl.service import messages
+from stagectl.service.places import default_socket
+
+_TIMEOUT_S = 5.0
+_WAIT_S = 5.0
+_RENEWALS_PER_LEASE = 4
+_REST_S, _LOOK_S = 30.0, 0.05
+_WITHOUT_POWER = ("off", "idle", "fault")
+_KINDS = {kind.__name__: kind for kind in (DriveError, LinkError, ProfileError, RecordError, RequestError, TimingError)}
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+def error_of(failure: messages.Failure) -> StagectlError:
+    """Return the error that the service tells of."""
+    return _KINDS.get(failure.kind, RequestError)(failure.message)
+
+
+class Client:
+    """A connection to one service. Motion needs a lease: take one with `lease`, which renews it while it is open."""
+
+    def __init__(self, socket_path: Path | None = None, *, tcp_port: int | None = None, token: str = ""):
+        """Over the service's socket (default: where it usually is), or a port of this machine with a token."""
+        self._path = None if tcp_port is not None else Path(socket_path or default_socket())
+        self.place = f"127.0.0.1:{tcp_port}" if tcp_port is not None else str(self._path)
+        transport = None if tcp_port is not None else httpx.HTTPTransport(uds=self.place)
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        url = f"http://{self.place}" if tcp_port is not None else "http://stagectl"
+        self._http = httpx.Client(
+            transport=transport, base_url=url, headers=headers, timeout=_TIMEOUT_S, trust_env=False
+        )
+        self.lease_token = ""
+        """Token of the lease that commands go by."""
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the connection; a lease that is held is not given back by that."""
+        self._http.close()
+
+    # ---- watching --------------------------------------------------------------------------------------------
+
+    def status(self) -> messages.Status:
+        """Return where things stand."""
+        return messages.Status.model_validate(self._ask("GET", "/v1/status"))
+
+    def fault(self) -> messages.Fault | None:
+        """Return why the stage stopped by itself; None where it did not."""
+        return TypeAdapter(messages.Fault | None).validate_python(self._ask("GET", "/v1/fault"))
+
+    def log(self, after: int | None = None, limit: int = 100) -> list[messages.LogEntry]:
+        """Return what the service did, behind a number, or the newest."""
+        asked = {"limit": limit} if after is None else {"after": after, "limit": limit}
+        return TypeAdapter(list[messages.LogEntry]).validate_python(self._ask("GET", "/v1/log", params=asked))
+
+    def runs(self) -> list[messages.RunEntry]:
+        """Return what was recorded, oldest first."""
+        return TypeAdapter(list[messages.RunEntry]).validate_python(self._ask("GET", "/v1/runs"))
+
+    def metrics(self) -> str:
+        """Return what Prometheus scrapes."""
+        return self._answer("GET", "/metrics").text
+
+    # ---- the lease -------------------------------------------------------------------------------------------
+
+    def lease_state(self) -> messages.LeaseState | None:
+        """Return who may move the stage; None where nobody does."""
+        return TypeAdapter(messages.LeaseState | None).validate_python(self._ask("GET", "/v1/lease"))
+
+    def take_lease(self, holder: str, duration_s: float = 2.0) -> messages.TakenLease:
+        """Take the lease; it has to be renewed within `duration_s`, again and again, or the stage stops."""
+        body = messages.TakeLease(holder=holder, duration_s=duration_s)
+        taken = messages.TakenLease.model_validate(self._ask("POST", "/v1/lease", body))
+        self.lease_token = taken.token
+        return taken
+
+    def renew_lease(self) -> messages.TakenLease:
+        """Renew the lease that is held."""
+        return messages.TakenLease.model_validate(self._ask("PUT", "/v1/lease"))
+
+    def give_lease_back(self) -> None:
+        """Give the lease back; a stage with power comes to rest."""
+        self._ask("DELETE", "/v1/lease")
+        self.lease_token = ""
+
+    @contextlib.contextmanager
+    def lease(self, holder: str, duration_s: float = 2.0) -> Iterator[messages.TakenLease]:
+        """Hold the lease and renew it from a thread; leaving gives it back and waits until the stage has no power."""
+        taken = self.take_lease(holder, duration_s)
+        over = threading.Event()
+        renewing = threading.Thread(target=self._renew_until, args=(over, duration_s), daemon=True)
+        renewing.start()
+        try:
+            yield taken
+        finally:
+            over.set()
+            renewing.join(_TIMEOUT_S)
+            with contextlib.suppress(StagectlError):  # it may be over already, and the stage with it
+                self.give_lease_back()
+                self._await_rest()
+
+    def _await_rest(self) -> None:
+        give_up_s = time.monotonic() + _REST_S
+        while self.status().state not in _WITHOUT_POWER and time.monotonic() < give_up_s:
+            time.sleep(_LOOK_S)
+
+    def _renew_until(self, over: threading.Event, duration_s: float) -> None:
+        while not over.wait(duration_s / _RENEWALS_PER_LEASE):
+            try:
+                self.renew_lease()
+            except LinkError:
+                continue  # the next may come through; the lease's end is the deadman
+            except StagectlError:
+                return
+
+    # ---- commands --------------------------------------------------------------------------------------------
+
+    def arm(self, law: messages.LawName | None = None) -> messages.Command:
+        """Give the drives power and hold."""
+        return self.do("arm", messages.Arm(law=law))
+
+    def home(self) -> messages.Command:
+        """Home both axes; ends armed."""
+        return self.do("home", messages.Home())
+
+    def move(self, target_m: float, law: messages.LawName | None = None) -> messages.Command:
+        """Move the end to a position."""
+        return self.do("move", messages.Move(target_m=target_m, law=law))
+
+    def jog(self, distance_m: float, law: messages.LawName | None = None) -> messages.Command:
+        """Move the end by a distance."""
+        return self.do("jog", messages.JogBy(distance_m=distance_m, law=law))
+
+    def identify(self, frequency_hz: float | None = None, duration_s: float = 20.0) -> messages.Command:
+        """Identify the backlash."""
+        return self.do("identify", messages.Identify(frequency_hz=frequency_hz, duration_s=duration_s))
+
+    def acknowledge(self, number: int) -> messages.Command:
+        """Take note of a fault; enables nothing."""
+        return self.do("acknowledge", messages.Acknowledge(number=number))
+
+    def swap_backend(self, backend: str) -> messages.Command:
+        """Work in another world; without power only."""
+        return self.do("backend", messages.SwapBackend.model_validate({"backend": backend}))
+
+    def jog_at(self, velocity_m_per_s: float, hold_s: float = 0.3) -> messages.Command:
+        """Jog at a velocity; to be said again before `hold_s` is over."""
+        body = messages.JogAt(velocity_m_per_s=velocity_m_per_s, hold_s=hold_s)
+        return messages.Command.model_validate(self._ask("PUT", "/v1/jog", body))
+
+    def stop(self) -> messages.Status:
+        """Bring the stage to rest and take the power away; needs no lease."""
+        return messages.Status.model_validate(self._ask("POST", "/v1/stop"))
+
+    def record(self, name: str = "request") -> messages.Status:
+        """Begin a run, where none is under way; needs no lease."""
+        return messages.Status.model_validate(self._ask("POST", "/v1/record", messages.StartRecord(name=name)))
+
+    def end_record(self) -> messages.Status:
+        """End the run that was asked for; needs no lease."""
+        return messages.Status.model_validate(self._ask("DELETE", "/v1/record"))
+
+    def begin(self, name: str, body: BaseModel, key: str = "") -> messages.Command:
+        """Send a command and don't wait; the same key again is the same command."""
+        headers = {"Idempotency-Key": key or f"client-{secrets.token_hex(12)}"}
+        return messages.Command.model_validate(self._ask("POST", f"/v1/{name}", body, headers=headers))
+
+    def command(self, key: str, wait_s: float = 0.0) -> messages.Command:
+        """Return what became of a command; waits for its end where asked to."""
+        asked = {"wait_s": wait_s}
+        return messages.Command.model_validate(self._ask("GET", f"/v1/commands/{key}", params=asked, more_s=wait_s))
+
+    def do(self, name: str, body: BaseModel) -> messages.Command:
+        """Send a command and wait for its end. Errors: what the service says; a stop by itself is no error."""
+        found = self.begin(name, body)
+        while found.state not in ("done", "failed"):
+            found = self.command(found.key, _WAIT_S)
+        if found.error is not None:
+            raise error_of(found.error)
+        return found
+
+    # ---- bytes -----------------------------------------------------------------------------------------------
+
+    def _ask(
+        self,
+        method: str,
+        path: str,
+        body: BaseModel | None = None,
+        headers: dict[str, str] | None = None,
+        params: dict[str, Any] | None = None,
+        more_s: float = 0.0,
+    ) -> Any:
+        answer = self._answer(method, path, body, headers, params, more_s)
+        return answer.json() if answer.content else None
+
+    def _answer(
+        self,
+        method: str,
+        path: str,
+        body: BaseModel | None = None,
+        headers: dict[str, str] | None = None,
+        params: dict[str, Any] | None = None,
+        more_s: float = 0.0,
+    ) -> httpx.Response:
+        if self._path is not None and not self._path.is_socket():
+            raise LinkError(f"{self.place}: no service has its socket there; is `stagectl serve` running?")
+        lease = {"Stagectl-Lease": self.lease_token} if self.lease_token else {}
+        try:
+            answer = self._http.request(
+                method,
+                path,
+                headers={**lease, **(headers or {})},
+                params=params,
+                timeout=_TIMEOUT_S + more_s,
+                json=None if body is None else body.model_dump(),
+            )
+        except httpx.HTTPError as error:
+            raise LinkError(
+                f"{self.place}: no answer from the service ({error}); is `stagectl serve` running?"
+            ) from error
+        if answer.is_success:
+            return answer
+        try:
+            failure = messages.Failure.model_validate_json(answer.content)
+        except ValueError as error:
+            raise LinkError(f"{self.place}: answered {answer.status_code} and no reason; is it a stagectl?") from error
+        raise error_of(failure)

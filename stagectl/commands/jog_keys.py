@@ -1,0 +1,104 @@
+"""`stagectl jog --keys`: hold an arrow key to move; a key let go, or a terminal that is gone, ends the motion."""
+
+import math
+import os
+import select
+import sys
+import termios
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stagectl.client import Client
+from stagectl.commands.answer import Answer, Voice
+from stagectl.commands.remote import connected, follow, leased
+from stagectl.errors import RequestError
+from stagectl.service import messages
+
+FIRST_HOLD_S = 0.6
+"""Of a key pressed anew: keyboards repeat after half a second."""
+
+NEXT_HOLD_S = 0.2
+_STEP_S = 0.05
+_RIGHT, _LEFT = (b"\x1b[C", b"\x1bOC", b"l", b"d"), (b"\x1b[D", b"\x1bOD", b"h", b"a")
+_FASTER, _SLOWER, _LEAVE = (b"\x1b[A", b"\x1bOA", b"+"), (b"\x1b[B", b"\x1bOB", b"-"), (b"q", b"\x04")
+
+_KNOWN = (*_RIGHT, *_LEFT, *_FASTER, *_SLOWER, *_LEAVE)
+
+
+class Hand:
+    """What the keys want: a direction for as long as a key is held, and a speed."""
+
+    def __init__(self, speed_m_per_s: float, top_m_per_s: float):
+        """Nothing is held yet."""
+        self.speed_m_per_s, self._top_m_per_s = min(speed_m_per_s, top_m_per_s), top_m_per_s
+        self._direction = 0.0
+        self._until_s = -math.inf
+        self.leaves = False
+
+    def press(self, keys: bytes, now_s: float) -> None:
+        """Take what came from the terminal; anything unknown lets go."""
+        while keys:
+            key = next((one for one in _KNOWN if keys.startswith(one)), keys[:1])
+            keys = keys[len(key) :]
+            if key in _RIGHT or key in _LEFT:
+                direction = 1.0 if key in _RIGHT else -1.0
+                goes_on = direction == self._direction and now_s < self._until_s
+                self._direction, self._until_s = direction, now_s + (NEXT_HOLD_S if goes_on else FIRST_HOLD_S)
+            elif key in _FASTER or key in _SLOWER:
+                self.speed_m_per_s = min(self.speed_m_per_s * (2.0 if key in _FASTER else 0.5), self._top_m_per_s)
+            else:
+                self.leaves = self.leaves or key in _LEAVE
+                self._direction, self._until_s = 0.0, -math.inf
+
+    def wanted_m_per_s(self, now_s: float) -> float:
+        """Return the velocity that the keys want now."""
+        return self._direction * self.speed_m_per_s if now_s < self._until_s else 0.0
+
+
+def jog(voice: Voice, socket: Path | None, token: str | None, speed_m_per_s: float) -> Answer:
+    """Home where it is needed, arm, and follow the keys until q."""
+    if not sys.stdin.isatty():
+        raise RequestError("--keys needs a terminal to read keys from; give --distance-m instead")
+    with connected(socket) as stage, leased(stage, token):
+        status = stage.status()
+        voice.note(status.banner)
+        if not status.homed:
+            follow(voice, stage, "home", messages.Home())
+        if stage.status().state == "idle":
+            follow(voice, stage, "arm", messages.Arm())
+        limits = stage.status().limits
+        top_m_per_s = math.inf if limits is None else limits.jog_velocity_m_per_s
+        voice.note("hold left or right to move, up and down double and halve the speed, space lets go, q ends")
+        with _bare_keys(sys.stdin.fileno()) as fileno:
+            _follow_keys(voice, stage, Hand(speed_m_per_s, top_m_per_s), fileno)
+        found = stage.status()
+    return Answer({"end_position_m": found.positions.end_position_m, "state": found.state}, ["let go"])
+
+
+def _follow_keys(voice: Voice, stage: Client, hand: Hand, fileno: int) -> None:
+    was_moving = False
+    while not hand.leaves:
+        voice.check()
+        if select.select([fileno], [], [], _STEP_S)[0]:
+            keys = os.read(fileno, 256)
+            if not keys:
+                return
+            hand.press(keys, time.monotonic())
+        wanted = hand.wanted_m_per_s(time.monotonic())
+        if wanted != 0.0 or was_moving:
+            stage.jog_at(wanted, hold_s=0.3)
+        was_moving = wanted != 0.0
+
+
+@contextmanager
+def _bare_keys(fileno: int) -> Iterator[int]:
+    """Have every key come at once and unseen; the terminal is as before afterwards."""
+    before = termios.tcgetattr(fileno)
+    try:
+        tty.setcbreak(fileno)
+        yield fileno
+    finally:
+        termios.tcsetattr(fileno, termios.TCSADRAIN, before)

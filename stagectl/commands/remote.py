@@ -1,0 +1,320 @@
+"""Commands that go through the service: status, watch, move, jog, home, identify, stop, fault, lease, backend, log."""
+
+import getpass
+import os
+import secrets
+import socket as sockets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pydantic import BaseModel, ValidationError
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.table import Table
+
+from stagectl.client import Client, error_of
+from stagectl.commands.answer import ENDED_EARLY, EXIT_CODES, Answer, Voice
+from stagectl.errors import LinkError, RequestError
+from stagectl.service import messages
+from stagectl.service.places import default_socket, is_served
+
+_LEASE_S = 3.0
+_POLL_S = 0.2
+_FINISHED = "FINISHED"
+
+
+def served(socket: Path | None, in_place: bool) -> bool:
+    """Tell whether a command goes through a service: one answers, and nobody asked for another way."""
+    return not in_place and is_served(socket or default_socket())
+
+
+def checked(kind: str, /, **values: object) -> BaseModel:
+    """Make a request of the API; RequestError where a value can't be in it."""
+    try:
+        return getattr(messages, kind)(**values)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        place = ".".join(str(part) for part in problem["loc"]).replace("_", "-")
+        raise RequestError(f"--{place} is {problem['input']!r}: {problem['msg']}") from error
+
+
+def connected(socket: Path | None) -> Client:
+    """Return a client; LinkError comes with its first request where nobody serves."""
+    return Client(socket)
+
+
+def _holder() -> str:
+    return f"{getpass.getuser()}@{sockets.gethostname()} (pid {os.getpid()})"
+
+
+@contextmanager
+def leased(stage: Client, token: str | None) -> Iterator[None]:
+    """Work under a lease that somebody holds (`token`), or under one of our own that ends with the command."""
+    if token:
+        stage.lease_token = token
+        yield
+        return
+    with stage.lease(_holder(), _LEASE_S):
+        yield
+
+
+# ---- motion -------------------------------------------------------------------------------------------------------
+
+
+def motion(
+    voice: Voice,
+    socket: Path | None,
+    token: str | None,
+    profile: str,
+    usual_profile: str,
+    backend: str,
+    name: str,
+    body: BaseModel,
+) -> Answer:
+    """Home where it is needed, arm, move; with a lease of our own the stage comes to rest without power."""
+    with connected(socket) as stage:
+        status = stage.status()
+        _refuse_other(status, profile, usual_profile, backend)
+        voice.note(f"{status.profile} through the service: {status.banner}")
+        with leased(stage, token):
+            command = _prepared(voice, stage, status, name)
+            if command is None:
+                command = follow(voice, stage, name, body)
+        at_rest = stage.status()
+    return _answer(command, at_rest)
+
+
+def _refuse_other(status: messages.Status, profile: str, usual_profile: str, backend: str) -> None:
+    """Refuse options that mean another stage than the service has."""
+    path = Path(profile)
+    is_its_file = path.exists() and path.resolve() == Path(status.profile_path).resolve()
+    if not is_its_file and profile not in (usual_profile, status.profile):
+        raise RequestError(
+            f"--profile {profile}: the service has {status.profile} ({status.profile_path}); leave the option out, "
+            "or add --in-place for a stage of its own"
+        )
+    if backend not in ("auto", status.backend):
+        raise RequestError(
+            f"--backend {backend}: the service has {status.backend or 'none yet'}; change that with "
+            "`stagectl backend`, or add --in-place for a stage of its own"
+        )
+
+
+def _prepared(voice: Voice, stage: Client, status: messages.Status, name: str) -> messages.Command | None:
+    """Home and arm; returns what went wrong, None where the stage holds."""
+    if name == "home":
+        return None
+    if not status.homed:
+        homed = follow(voice, stage, "home", messages.Home())
+        if homed.stop != _FINISHED:
+            return homed
+    if stage.status().state == "idle":
+        armed = follow(voice, stage, "arm", messages.Arm())
+        if armed.stop != _FINISHED:
+            return armed
+    return None
+
+
+def follow(voice: Voice, stage: Client, name: str, body: BaseModel) -> messages.Command:
+    """Send a command and show how far it is until it ends. Errors: what the service says."""
+    found = stage.begin(name, body, f"cli-{secrets.token_hex(12)}")
+    while found.state not in ("done", "failed"):
+        voice.progress(found.text or name, found.share)
+        found = stage.command(found.key, _POLL_S)
+    voice.progress.done()
+    if found.error is not None:
+        raise error_of(found.error)
+    return found
+
+
+def _answer(command: messages.Command, status: messages.Status) -> Answer:
+    finished = command.stop in ("", _FINISHED)
+    text = f"{command.name}: {command.text}"
+    shown: list[RenderableType] = [escape(text) if finished else f"[red]ended early[/]: {escape(text)}"]
+    joint = command.backlash
+    if joint is not None:
+        sd = "" if joint.width_sd_m is None else f" +- {joint.width_sd_m * 1e6:.2f} um"
+        shown.append(f"backlash {joint.width_m * 1e6:.2f} um{sd}")
+    shown.append(f"run     {escape(command.run)}")
+    data = {
+        "stop": command.stop,
+        "finished": finished,
+        "text": text,
+        "run": command.run,
+        "backlash": None if joint is None else joint.model_dump(),
+        "end_position_m": status.positions.end_position_m,
+        "state": status.state,
+        "banner": status.banner,
+        "remarks": status.remarks,
+    }
+    ended_early = EXIT_CODES[LinkError] if command.stop == "LINK_LOST" else ENDED_EARLY
+    return Answer(data, shown, 0 if finished else ended_early)
+
+
+# ---- watching -----------------------------------------------------------------------------------------------------
+
+
+def status(voice: Voice, socket: Path | None) -> Answer:
+    """Show where things stand."""
+    with connected(socket) as stage:
+        found = stage.status()
+    return Answer(found.model_dump(), [status_table(found)])
+
+
+def watch(voice: Voice, socket: Path | None, as_json: bool, looks_count: int | None) -> Answer:
+    """Show where things stand, again and again, until Ctrl-C or so many looks."""
+    from rich.live import Live
+
+    with connected(socket) as stage:
+        found = stage.status()
+        if as_json:
+            _look_again(voice, stage, looks_count, lambda seen: print(seen.model_dump_json(), flush=True))
+            return Answer({"looks_count": looks_count}, [])
+        with Live(status_table(found), console=voice.console, auto_refresh=False) as live:
+            _look_again(voice, stage, looks_count, lambda seen: live.update(status_table(seen), refresh=True))
+    return Answer({}, [])
+
+
+def _look_again(voice: Voice, stage: Client, looks_count: int | None, show: Callable[[messages.Status], None]) -> None:
+    import time
+
+    looks = 0
+    while looks_count is None or looks < looks_count:
+        show(stage.status())
+        looks += 1
+        voice.check()
+        time.sleep(_POLL_S)
+
+
+def status_table(found: messages.Status) -> Table:
+    """Lay a status out for a terminal."""
+    table = Table.grid(padding=(0, 2))
+    style = {"fault": "bold red", "off": "yellow", "idle": "cyan"}.get(found.state, "green")
+    table.add_row("[dim]world[/]", f"[bold]{escape(found.banner)}[/]")
+    table.add_row("[dim]state[/]", f"[{style}]{found.state}[/], {'homed' if found.homed else 'not homed'}")
+    table.add_row("[dim]profile[/]", escape(f"{found.profile} ({found.profile_path})"))
+    if found.waiting_for:
+        table.add_row("[dim]waiting for[/]", f"[yellow]{escape(found.waiting_for)}[/]")
+    if found.fault is not None:
+        fault = found.fault
+        table.add_row(f"[red]fault {fault.number}[/]", escape(f"{fault.at}, while {fault.state}: {fault.what}"))
+        table.add_row("", escape(fault.values))
+        table.add_row("[dim]what to do[/]", escape(fault.remedy))
+    at = found.positions
+    if at.end_position_m is not None and at.error_m is not None:
+        table.add_row("[dim]end[/]", f"{at.end_position_m * 1e3:.6f} mm, error {at.error_m * 1e6:.3f} um")
+    if at.macro_position_m is not None and at.relative_position_m is not None:
+        relative_um = at.relative_position_m * 1e6
+        table.add_row("[dim]macro[/]", f"{at.macro_position_m * 1e3:.6f} mm, end minus macro {relative_um:.2f} um")
+    if found.command is not None:
+        table.add_row(
+            "[dim]command[/]", escape(f"{found.command.text or found.command.name}  {found.command.share:.0%}")
+        )
+    lease = found.lease
+    table.add_row("[dim]lease[/]", "free" if lease is None else escape(f"{lease.holder}, {lease.left_s:.1f} s"))
+    joint = found.backlash
+    if joint is not None:
+        sd = "" if joint.width_sd_m is None else f" +- {joint.width_sd_m * 1e6:.2f} um"
+        table.add_row("[dim]backlash[/]", escape(f"{joint.width_m * 1e6:.2f} um{sd}, identified {joint.at}"))
+    health = found.health
+    late = "" if health.lateness_p99_s is None else f", 99 % within {health.lateness_p99_s * 1e6:.0f} us"
+    table.add_row("[dim]cycles[/]", f"{health.cycles_count}, {health.missed_cycles_count} missed{late}")
+    if found.recording is not None:
+        run = found.recording.run or "flight recorder only"
+        table.add_row("[dim]recording[/]", escape(f"{run} {found.recording.trouble}".strip()))
+    for remark in found.remarks:
+        table.add_row("[dim]remark[/]", f"[yellow]{escape(remark)}[/]")
+    return table
+
+
+def log(voice: Voice, socket: Path | None, lines_count: int) -> Answer:
+    """Show what the service did last."""
+    with connected(socket) as stage:
+        entries = stage.log(limit=lines_count)
+    shown = [escape(f"{entry.at}  {entry.event:<15} {entry.text}") for entry in entries]
+    return Answer({"entries": [entry.model_dump() for entry in entries]}, shown)
+
+
+# ---- the rest -----------------------------------------------------------------------------------------------------
+
+
+def stop(voice: Voice, socket: Path | None) -> Answer:
+    """Bring the stage to rest, and wait until it has no power."""
+    with connected(socket) as stage:
+        found = stage.stop()
+        while found.state in ("arming", "armed", "moving", "identifying", "stopping"):
+            voice.progress("coming to rest", 0.0)
+            found = stage.status()
+    voice.progress.done()
+    return Answer({"state": found.state}, [f"stopped; the state is {found.state}"])
+
+
+def fault(voice: Voice, socket: Path | None, token: str | None, acknowledge: bool) -> Answer:
+    """Show the fault, or take note of it."""
+    with connected(socket) as stage:
+        found = stage.fault()
+        if found is None:
+            return Answer({"fault": None, "acknowledged": False}, ["no fault"])
+        shown = [
+            f"[red]fault {found.number}[/] {escape(found.at)}, while {found.state}",
+            escape(f"{found.what}: {found.values}"),
+            escape(f"what to do: {found.remedy}"),
+        ]
+        if acknowledge:
+            with leased(stage, token):
+                follow(voice, stage, "acknowledge", messages.Acknowledge(number=found.number))
+            shown.append("acknowledged; nothing was enabled")
+    data = {"fault": found.model_dump(), "acknowledged": acknowledge}
+    return Answer(data, shown, 0 if acknowledge else ENDED_EARLY)
+
+
+def lease(voice: Voice, socket: Path | None, hold: bool) -> Answer:
+    """Show who holds the lease, or hold it until Ctrl-C."""
+    with connected(socket) as stage:
+        if not hold:
+            held = stage.lease_state()
+            text = "free" if held is None else f"{held.holder}, {held.left_s:.1f} s left"
+            return Answer({"lease": None if held is None else held.model_dump()}, [escape(text)])
+        with stage.lease(_holder(), _LEASE_S) as taken:
+            print(f"export STAGECTL_LEASE={taken.token}", flush=True)
+            voice.note("held until Ctrl-C; then the stage comes to rest without power")
+            _look_again(voice, stage, None, lambda seen: _still_ours(seen, taken.holder))
+    return Answer({}, [])
+
+
+def _still_ours(seen: messages.Status, holder: str) -> None:
+    if seen.lease is None or seen.lease.holder != holder:
+        raise RequestError("the lease was lost: it was not renewed in time; the stage was stopped")
+
+
+def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> Answer:
+    """Show what is recorded, begin a run, or end the one that was asked for."""
+    import time
+
+    with connected(socket) as stage:
+        if end or name is not None:
+            if end:
+                stage.end_record()
+            else:
+                stage.record(checked("StartRecord", name=name).name)  # pyright: ignore[reportAttributeAccessIssue]
+            time.sleep(_POLL_S)
+        found = stage.status().recording
+    text = "nothing: the stage is not connected"
+    if found is not None:
+        text = f"{found.run}, begun by {found.trigger}" if found.run else "the last seconds only, in memory"
+    shown = [escape(text), *([f"[red]{escape(found.trouble)}[/]"] if found is not None and found.trouble else [])]
+    return Answer({"recording": None if found is None else found.model_dump()}, shown)
+
+
+def backend(voice: Voice, socket: Path | None, token: str | None, name: str | None) -> Answer:
+    """Show which world it is, or change it."""
+    with connected(socket) as stage:
+        if name is not None:
+            asked = checked("SwapBackend", backend=name)
+            with leased(stage, token):
+                follow(voice, stage, "backend", asked)
+        found = stage.status()
+    shown = [found.banner, *([f"waiting for {escape(found.waiting_for)}"] if found.waiting_for else [])]
+    data = {"backend": found.backend, "banner": found.banner, "waiting_for": found.waiting_for, "state": found.state}
+    return Answer(data, shown)

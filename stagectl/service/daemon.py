@@ -1,0 +1,56 @@
+"""`stagectl serve`: the parts put together. The main thread is the stage's, a second one answers clients."""
+
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+
+from stagectl.errors import RequestError
+from stagectl.record import recover_orphans
+from stagectl.service.access import Access, read_tokens
+from stagectl.service.api import application
+from stagectl.service.desk import Desk
+from stagectl.service.exposition import Figures
+from stagectl.service.listener import Listener
+from stagectl.service.notify import Notifier
+from stagectl.service.places import listen_tcp, listen_unix
+from stagectl.service.remembered import recall
+from stagectl.service.service_log import ServiceLog
+from stagectl.service.stage_loop import Settings, StageLoop, hear_signals
+
+TOKENS = "tokens"
+
+
+def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
+    """Serve one stage until SIGTERM. Errors: LinkError, ProfileError, RecordError, RequestError before it begins."""
+    log, notifier, figures = ServiceLog(), Notifier(), Figures()
+    remembered, remark = recall(settings.state_folder)
+    if remark:
+        log.say("state_lost", remark)
+    asked = settings.profile or remembered.profile
+    if not asked:
+        raise RequestError("which profile? none was served before; give one: stagectl serve PROFILE")
+    settings = replace(settings, profile=asked)
+    desk = Desk(log)
+    api = application(desk, log, figures, settings.runs_root, metadata.version("stagectl"))
+    sockets = [(listen_unix(socket_path), Access(api, None))]
+    log.say("listening", str(socket_path))
+    if tcp_port is not None:
+        tokens_path = settings.state_folder / TOKENS
+        settings.state_folder.mkdir(parents=True, exist_ok=True)
+        tokens = read_tokens(tokens_path)
+        listening = listen_tcp(tcp_port)
+        sockets.append((listening, Access(api, tokens)))
+        log.say("listening", f"127.0.0.1:{listening.getsockname()[1]}, tokens in {tokens_path}")
+    for ring, outcome in recover_orphans():
+        log.say("recovered", str(outcome), ring=str(ring))
+    loop = StageLoop(settings, desk, log, remembered, notifier, figures)
+    hear_signals(loop)
+    listener = Listener(sockets)
+    listener.start()
+    notifier.say(READY=1, STATUS="listening")
+    try:
+        loop.run()
+    finally:
+        listener.close()
+        socket_path.unlink(missing_ok=True)
+        log.say("ended")

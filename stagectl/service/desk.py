@@ -1,0 +1,314 @@
+"""Where clients and the stage meet: the lease, the one command at a time, and the newest status.
+
+Any thread may call it; nothing here touches the stage. The stage's thread takes orders and publishes.
+"""
+
+import math
+import secrets
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+from stagectl.errors import RequestError, StagectlError
+from stagectl.profile import Profile
+from stagectl.service import lease as leases
+from stagectl.service import messages, states
+from stagectl.service.lease import Lease
+from stagectl.service.scope import Scope
+from stagectl.service.service_log import ServiceLog, now_text
+from stagectl.service.states import Event, State
+from stagectl.service.view import jog_velocity_m_per_s
+
+_KEPT_ORDERS_COUNT = 1000
+
+_EVENTS = {
+    "arm": Event.ARM,
+    "home": Event.HOME,
+    "move": Event.MOVE,
+    "jog": Event.MOVE,
+    "jog_at": Event.MOVE,
+    "identify": Event.IDENTIFY,
+}
+"""What a command does to the state; the others have none of their own."""
+
+
+class Busy(RequestError):
+    """Another command is under way, or the stage is coming to rest."""
+
+
+class Unfit(RequestError):
+    """A value can't be on this stage, or a key was used for something else."""
+
+
+class Ending(RequestError):
+    """The service is ending."""
+
+
+class Order:
+    """A command on its way through the service."""
+
+    def __init__(self, key: str, name: str, body: Any, token: str, clock_s: Callable[[], float]):
+        """Wait to be carried out."""
+        self.key, self.name, self.body, self.token = key, name, body, token
+        self._clock_s = clock_s
+        self._message = messages.Command(key=key, name=name, state="waiting", share=0.0, at=now_text())
+        self._velocity_m_per_s, self._until_s = 0.0, -math.inf
+
+    def message(self) -> messages.Command:
+        """Return what there is to say of it; the next change makes a new message."""
+        return self._message
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more will become of it."""
+        return self._message.state in ("done", "failed")
+
+    def begin(self) -> None:
+        """It is being carried out."""
+        self._change(state="running")
+
+    def progress(self, what: str, share: float) -> None:
+        """Say how far it is."""
+        if not self.over:
+            self._change(text=what, share=min(max(share, 0.0), 1.0))
+
+    def finish(self, text: str, stop: str, run: str, backlash: messages.Backlash | None) -> None:
+        """It came to an end; `stop` says which."""
+        self._change(state="done", share=1.0, text=text, stop=stop, run=run, backlash=backlash)
+
+    def fail(self, error: StagectlError) -> None:
+        """It was refused, or something broke."""
+        failure = messages.Failure(kind=type(error).__name__, message=str(error))
+        self._change(state="failed", text=str(error), error=failure)
+
+    def _change(self, **changes: Any) -> None:
+        self._message = self._message.model_copy(update=changes)
+
+    def hold(self, velocity_m_per_s: float, hold_s: float) -> None:
+        """Have a jog go on at this velocity for so long."""
+        self._velocity_m_per_s, self._until_s = velocity_m_per_s, self._clock_s() + hold_s
+
+    def wanted_m_per_s(self) -> float | None:
+        """Return the velocity that is wanted now; None where nobody holds the key any more."""
+        return self._velocity_m_per_s if self._clock_s() < self._until_s else None
+
+
+class Desk:
+    """What clients and the stage's thread share."""
+
+    def __init__(self, log: ServiceLog, clock_s: Callable[[], float] = time.monotonic):
+        """Nobody holds the lease, nothing is under way."""
+        self._log, self._clock_s = log, clock_s
+        self._lock = threading.RLock()
+        self._lease: Lease | None = None
+        self._orders: OrderedDict[str, Order] = OrderedDict()
+        self._current: Order | None = None
+        self._waiting: Order | None = None
+        self._stop_reason = ""
+        self._stop = threading.Event()
+        self._record_request: str | None = None
+        self._closed = False
+        self._status: messages.Status | None = None
+        self._state = State.OFF
+        self.powered = False
+        """Whether the stage's thread has the stage in a state with power."""
+        self.profile: Profile | None = None
+        self.scope = Scope(1000.0)
+
+    # ---- what the stage's thread does ------------------------------------------------------------------------
+
+    def publish(self, status: messages.Status, state: State) -> None:
+        """Put the newest status out."""
+        self._status, self._state = status, state
+        if self._lease is not None and self._lease.released and not self.powered:
+            with self._lock:
+                self._lease = None
+
+    def next_order(self) -> Order | None:
+        """Take the command that waits."""
+        with self._lock:
+            order, self._waiting = self._waiting, None
+            return order
+
+    def check_order(self, order: Order) -> None:
+        """Refuse what may not begin any more."""
+        if self._stop.is_set():
+            raise Busy(f"{order.name}: stopped before it began: {self._stop_reason}")
+        with self._lock:
+            leases.holds(self._lease, order.token, self._clock_s())
+
+    @property
+    def stop_asked(self) -> bool:
+        """Whether somebody asked for rest, and it was not seen to yet."""
+        return self._stop.is_set()
+
+    @property
+    def stop_reason(self) -> str:
+        """Why."""
+        return self._stop_reason
+
+    def stopped(self) -> None:
+        """The stage was brought to rest."""
+        self._stop.clear()
+
+    def lease_left_s(self) -> float:
+        """Return how long the stage may still move."""
+        lease = self._lease
+        return 0.0 if lease is None else lease.left_s(self._clock_s())
+
+    def close(self) -> None:
+        """Take no more commands; what waits is refused."""
+        with self._lock:
+            self._closed = True
+            self._drop_waiting("the service is ending")
+
+    def next_record_request(self) -> str | None:
+        """Take the name of a run that somebody asked for, "" for its end; None where nobody asked."""
+        if self._record_request is None:
+            return None
+        with self._lock:
+            asked, self._record_request = self._record_request, None
+            return asked
+
+    # ---- what clients do -------------------------------------------------------------------------------------
+
+    def status(self) -> messages.Status:
+        """Return the newest status; Ending before there is one."""
+        if self._status is None:
+            raise Ending("the service has just begun; ask again")
+        return self._status.model_copy(update={"lease": self.lease_state()})
+
+    def lease_state(self) -> messages.LeaseState | None:
+        """Say who holds the lease, without its token."""
+        lease = self._lease
+        left_s = 0.0 if lease is None else lease.left_s(self._clock_s())
+        if lease is None or left_s == 0.0:
+            return None
+        return messages.LeaseState(holder=lease.holder, left_s=left_s, duration_s=lease.duration_s)
+
+    def take_lease(self, body: messages.TakeLease) -> messages.TakenLease:
+        """Give the lease to a client. Errors: LeaseRefused, RequestError."""
+        with self._lock:
+            self._refuse_when_closed()
+            token = secrets.token_urlsafe(24)
+            now_s = self._clock_s()
+            self._lease = leases.take(self._lease, token, body.holder, body.duration_s, now_s, self.powered)
+            self._log.say("lease_taken", holder=body.holder, duration_s=body.duration_s)
+            return self._taken(self._lease)
+
+    def renew_lease(self, token: str) -> messages.TakenLease:
+        """Prolong a client's lease. Errors: LeaseRefused."""
+        with self._lock:
+            self._lease = leases.renew(self._lease, token, self._clock_s())
+            return self._taken(self._lease)
+
+    def give_lease_back(self, token: str) -> None:
+        """End a client's lease; a stage with power is brought to rest. Errors: LeaseRefused."""
+        with self._lock:
+            held = leases.holds(self._lease, token, self._clock_s())
+            busy = self.powered or self._waiting is not None or (self._current is not None and not self._current.over)
+            self._lease = leases.give_back(self._lease, token, self._clock_s(), busy)
+            self._log.say("lease_given_back", holder=held.holder)
+            if busy:
+                self.ask_to_stop(f"{held.holder} gave the lease back")
+
+    def _taken(self, lease: Lease) -> messages.TakenLease:
+        left_s = lease.left_s(self._clock_s())
+        return messages.TakenLease(holder=lease.holder, left_s=left_s, duration_s=lease.duration_s, token=lease.token)
+
+    def ask_to_stop(self, reason: str) -> None:
+        """Have the stage brought to rest; needs no lease. What waits is not begun."""
+        self._stop_reason = reason
+        self._stop.set()
+        with self._lock:
+            self._drop_waiting(reason)
+        self._log.say("stop", reason)
+
+    def ask_to_record(self, name: str) -> None:
+        """Begin a run, or end the one that was asked for (""); needs no lease. Errors: Busy, Ending."""
+        with self._lock:
+            self._refuse_when_closed()
+            if self._record_request is not None:
+                raise Busy("another client asks the same just now; ask again")
+            if self._state is State.OFF:
+                raise Busy("there is nothing to record: the stage is not connected")
+            self._record_request = name
+            self._log.say("record", name or "end")
+
+    def _drop_waiting(self, reason: str) -> None:
+        waiting, self._waiting = self._waiting, None
+        if waiting is not None:
+            waiting.fail(Busy(f"{waiting.name}: stopped before it began: {reason}"))
+
+    def submit(self, name: str, body: Any, key: str, token: str) -> messages.Command:
+        """Take a command over, or return what became of it where its key was seen. Errors: RequestError and kinds."""
+        with self._lock:
+            known = self._orders.get(key)
+            if known is not None:
+                if known.name != name or known.body != body:
+                    raise Unfit(f"key {key!r} was used for another {known.name}; take a new key for a new command")
+                return known.message()
+            self._refuse_when_closed()
+            leases.holds(self._lease, token, self._clock_s())
+            self._refuse_when_busy(name)
+            if name in _EVENTS:
+                states.after(self._state, _EVENTS[name])
+            self._check_values(name, body)
+            order = Order(key, name, body, token, self._clock_s)
+            if name == "jog_at":
+                order.hold(body.velocity_m_per_s, body.hold_s)
+            self._keep_order(order)
+            return order.message()
+
+    def jog_at(self, body: messages.JogAt, token: str) -> messages.Command:
+        """Begin to jog, or go on at this velocity. Errors: RequestError and kinds."""
+        with self._lock:
+            leases.holds(self._lease, token, self._clock_s())
+            order = self._current
+            if order is not None and order.name == "jog_at" and not order.over:
+                if self._stop.is_set():
+                    raise Busy("the stage is coming to rest; wait until it stands")
+                self._check_values("jog_at", body)
+                order.hold(body.velocity_m_per_s, body.hold_s)
+                return order.message()
+            return self.submit("jog_at", body, f"jog-{secrets.token_hex(8)}", token)
+
+    def command(self, key: str) -> messages.Command | None:
+        """Return what became of a command; None where no such key was seen."""
+        with self._lock:
+            order = self._orders.get(key)
+        return None if order is None else order.message()
+
+    def _keep_order(self, order: Order) -> None:
+        self._orders[order.key] = self._current = self._waiting = order
+        while len(self._orders) > _KEPT_ORDERS_COUNT:
+            self._orders.popitem(last=False)
+
+    def _refuse_when_closed(self) -> None:
+        if self._closed:
+            raise Ending("the service is ending; try again when it is back")
+
+    def _refuse_when_busy(self, name: str) -> None:
+        if self._stop.is_set():
+            raise Busy(f"{name}: the stage is coming to rest; wait until it stands")
+        if self._current is not None and not self._current.over:
+            raise Busy(f"{name}: {self._current.name} is under way; wait for its end, or stop it")
+
+    def _check_values(self, name: str, body: Any) -> None:
+        """Refuse at once what this stage can never do. Errors: Unfit."""
+        profile = self.profile
+        if profile is None:
+            return
+        low_m, high_m = profile.macro.travel_m
+        travel = f"the travel of {profile.name} is [{low_m:g}, {high_m:g}] m"
+        if name == "move" and not low_m <= body.target_m <= high_m:
+            raise Unfit(f"target_m is {body.target_m:g}: {travel}; give a position within it")
+        if name == "jog" and not abs(body.distance_m) <= high_m - low_m:
+            raise Unfit(f"distance_m is {body.distance_m:g}: {travel}; give a distance within it")
+        top = jog_velocity_m_per_s(profile)
+        if name == "jog_at" and not abs(body.velocity_m_per_s) <= top:
+            raise Unfit(f"velocity_m_per_s is {body.velocity_m_per_s:g}: a jog may do {top:g} m/s; ask for less")
+        if name == "identify" and profile.micro is None:
+            raise Unfit(f"profile {profile.name}: this stage has no micro; there is no backlash to identify")

@@ -1,0 +1,59 @@
+"""The thread that listens: one uvicorn for each socket, on one event loop, beside the stage's thread."""
+
+import asyncio
+import socket
+import threading
+from collections.abc import Sequence
+
+import uvicorn
+
+from stagectl.service.access import Application
+
+_CLOSE_S = 2.0
+_CONNECTIONS_LIMIT = 100
+_START_S = 10.0
+
+
+class Listener:
+    """Serves applications on sockets until `close`."""
+
+    def __init__(self, served: Sequence[tuple[socket.socket, Application]]):
+        """Take sockets that listen already; nothing is answered before `start`."""
+        self._sockets = [listening for listening, _ in served]
+        self._servers = [
+            uvicorn.Server(
+                uvicorn.Config(
+                    application,  # pyright: ignore[reportArgumentType]
+                    lifespan="off",
+                    log_config=None,
+                    access_log=False,
+                    ws="websockets-sansio",
+                    ws_max_size=4096,
+                    limit_concurrency=_CONNECTIONS_LIMIT,
+                    timeout_graceful_shutdown=int(_CLOSE_S),
+                    server_header=False,
+                )
+            )
+            for _, application in served
+        ]
+        self._thread = threading.Thread(target=self._work, name="api", daemon=True)
+
+    def start(self) -> None:
+        """Answer from now on."""
+        self._thread.start()
+
+    def _work(self) -> None:
+        asyncio.run(self._serve())
+
+    async def _serve(self) -> None:
+        await asyncio.gather(
+            *(server.serve(sockets=[listening]) for server, listening in zip(self._servers, self._sockets, strict=True))
+        )
+
+    def close(self) -> None:
+        """Answer no more."""
+        for server in self._servers:
+            server.should_exit = True
+        self._thread.join(_START_S)
+        for listening in self._sockets:
+            listening.close()

@@ -1,0 +1,238 @@
+"""What goes over the API, both ways; the server checks it and the client has it as types. Units are in the names."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Key = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[A-Za-z0-9._:-]+$")]
+LawName = Literal["pid", "dsmc"]
+RunName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+
+
+class _Asked(BaseModel):
+    """A request's body: every key known, numbers are numbers and finite."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class TakeLease(_Asked):
+    """Ask for the lease on motion."""
+
+    holder: Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f]+$")]
+    duration_s: Annotated[Finite, Field(ge=0.2, le=30.0)] = 2.0
+
+
+class Arm(_Asked):
+    """Give the drives power and hold."""
+
+    law: LawName | None = None
+
+
+class Home(_Asked):
+    """Home both axes."""
+
+
+class Move(_Asked):
+    """Move the end to a position, from the homed zero."""
+
+    target_m: Annotated[Finite, Field(ge=-100.0, le=100.0)]
+    law: LawName | None = None
+
+
+class JogBy(_Asked):
+    """Move the end by a distance."""
+
+    distance_m: Annotated[Finite, Field(ge=-100.0, le=100.0)]
+    law: LawName | None = None
+
+
+class JogAt(_Asked):
+    """Move at a velocity for as long as this is said again before `hold_s` is over; 0 holds still."""
+
+    velocity_m_per_s: Annotated[Finite, Field(ge=-20.0, le=20.0)]
+    hold_s: Annotated[Finite, Field(ge=0.05, le=1.0)] = 0.3
+
+
+class Identify(_Asked):
+    """Sweep the micro over both edges."""
+
+    frequency_hz: Annotated[Finite, Field(ge=0.05, le=5.0)] | None = None
+    duration_s: Annotated[Finite, Field(ge=2.0, le=240.0)] = 20.0
+
+
+class SwapBackend(_Asked):
+    """Work in another world; only without power."""
+
+    backend: Literal["auto", "hardware", "rig"]
+
+
+class StartRecord(_Asked):
+    """Begin a run on request."""
+
+    name: RunName = "request"
+
+
+class Acknowledge(_Asked):
+    """Take note of a fault; enables nothing. `number` is the fault's, so that no newer one goes unseen."""
+
+    number: Annotated[int, Field(ge=1, le=10**9)]
+
+
+class Failure(BaseModel):
+    """Why something was refused or failed: place, value, limit, remedy."""
+
+    kind: str
+    message: str
+
+
+class Backlash(BaseModel):
+    """The joint as it was identified."""
+
+    width_m: float
+    centre_m: float
+    left_m: float
+    right_m: float
+    left_stiffness_n_per_m: float
+    right_stiffness_n_per_m: float
+    width_sd_m: float | None
+    at: str
+    """When, UTC."""
+    run: str
+    profile_name: str
+
+
+class Fault(BaseModel):
+    """Why the stage stopped by itself: what happened, when, the values, and what to do."""
+
+    number: int
+    kind: str
+    what: str
+    values: str
+    remedy: str
+    at: str
+    state: str
+    """What it was doing then."""
+
+
+class LeaseState(BaseModel):
+    """Who may move the stage."""
+
+    holder: str
+    left_s: float
+    duration_s: float
+
+
+class TakenLease(LeaseState):
+    """A lease with its token, for its holder alone."""
+
+    token: str
+
+
+class Command(BaseModel):
+    """A command and what became of it."""
+
+    key: str
+    name: str
+    state: Literal["waiting", "running", "done", "failed"]
+    share: float
+    at: str
+    text: str = ""
+    stop: str = ""
+    """Name of the Stop that ended a motion; FINISHED where it came to its own end."""
+    run: str = ""
+    backlash: Backlash | None = None
+    error: Failure | None = None
+
+
+class Recording(BaseModel):
+    """What goes to the disk now."""
+
+    run: str
+    trigger: str
+    """arm | request | always; empty where only the flight recorder keeps the last seconds."""
+    rows_count: int
+    trouble: str
+    """What the disk refuses; empty where all is well."""
+
+
+class Health(BaseModel):
+    """How the loop keeps time."""
+
+    cycles_count: int
+    missed_cycles_count: int
+    lost_samples_count: int
+    discarded_bytes_count: int
+    rate_hz: float
+    lateness_p99_s: float | None
+    lateness_max_s: float | None
+
+
+class Positions(BaseModel):
+    """Where the stage is; from the homed zero once it is homed."""
+
+    end_position_m: float | None
+    macro_position_m: float | None
+    macro_encoder_m: float | None
+    relative_position_m: float | None
+    setpoint_position_m: float | None
+    error_m: float | None
+
+
+class Limits(BaseModel):
+    """What this stage may be asked for."""
+
+    travel_m: tuple[float, float]
+    velocity_m_per_s: float
+    jog_velocity_m_per_s: float
+    has_micro: bool
+    rate_hz: float
+
+
+class Status(BaseModel):
+    """Everything that a client needs to know at a glance."""
+
+    state: str
+    since: str
+    banner: str
+    """Which world this is; to be shown by every client."""
+    backend: str
+    backend_description: str
+    profile: str
+    profile_path: str
+    waiting_for: str
+    homed: bool
+    phase: str
+    limits: Limits | None
+    positions: Positions
+    health: Health
+    backlash: Backlash | None
+    fault: Fault | None
+    lease: LeaseState | None
+    command: Command | None
+    recording: Recording | None
+    remarks: list[str]
+    version: str
+    uptime_s: float
+
+
+class LogEntry(BaseModel):
+    """One line of the service's log."""
+
+    number: int
+    at: str
+    event: str
+    text: str
+    fields: dict[str, Any]
+
+
+class RunEntry(BaseModel):
+    """One recorded run."""
+
+    name: str
+    state: str
+    rows_count: int
+    duration_s: float
+    profile: str
+    stop: str
+    text: str

@@ -1,0 +1,81 @@
+"""Where the service listens: a Unix socket for this machine's users, TCP on loopback only when asked for."""
+
+import errno
+import os
+import socket
+import stat
+from pathlib import Path
+
+from stagectl.errors import LinkError, RequestError
+
+SOCKET_NAME = "stagectl.socket"
+SYSTEM_FOLDER = Path("/run/stagectl")
+SOCKET_MODE = 0o660
+_BACKLOG = 64
+
+
+def default_socket() -> Path:
+    """Return the socket of the service: $STAGECTL_SOCKET, the system's, else the user's own."""
+    given = os.environ.get("STAGECTL_SOCKET", "")
+    if given:
+        return Path(given)
+    if os.access(SYSTEM_FOLDER, os.W_OK) or (SYSTEM_FOLDER / SOCKET_NAME).exists():
+        return SYSTEM_FOLDER / SOCKET_NAME
+    folder = os.environ.get("XDG_RUNTIME_DIR", "")
+    return Path(folder or f"/tmp/stagectl-{os.getuid()}") / SOCKET_NAME
+
+
+def is_served(path: Path) -> bool:
+    """Tell whether a service answers on a socket's path."""
+    if not path.is_socket():
+        return False
+    asked = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        asked.settimeout(1.0)
+        asked.connect(str(path))
+    except OSError as error:
+        return error.errno == errno.EACCES  # somebody's, and not for us: not to be taken either
+    finally:
+        asked.close()
+    return True
+
+
+def listen_unix(path: Path) -> socket.socket:
+    """Listen on a path, for its owner and group; takes the place of a dead service's. Errors: LinkError."""
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
+        found = path.parent.stat()
+        if found.st_uid not in (0, os.getuid()) or (found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX):
+            raise LinkError(f"{path.parent}: others may put a socket of theirs here; give another path with --socket")
+        if is_served(path):
+            raise LinkError(f"{path}: a service listens here already; stop it, or give another path with --socket")
+        path.unlink(missing_ok=True)
+        before = os.umask(0o777 & ~SOCKET_MODE)
+        try:
+            listening.bind(str(path))
+        finally:
+            os.umask(before)
+        listening.listen(_BACKLOG)
+    except OSError as error:
+        listening.close()
+        raise LinkError(f"{path}: can't listen: {error.strerror}; give another path with --socket") from error
+    except LinkError:
+        listening.close()
+        raise
+    return listening
+
+
+def listen_tcp(port: int) -> socket.socket:
+    """Listen on a port of 127.0.0.1. Errors: LinkError, RequestError."""
+    if not 0 <= port <= 65535:
+        raise RequestError(f"--tcp {port}: a port is a number from 0 (any that is free) to 65535")
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(("127.0.0.1", port))
+        listening.listen(_BACKLOG)
+    except OSError as error:
+        listening.close()
+        raise LinkError(f"127.0.0.1:{port}: can't listen: {error.strerror}; give another port with --tcp") from error
+    return listening

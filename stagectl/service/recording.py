@@ -1,0 +1,154 @@
+"""What of a session goes to the disk: every powered motion, what is asked for, the last seconds before a fault."""
+
+import shutil
+import threading
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from stagectl.errors import RecordError, RequestError
+from stagectl.flight_recorder import FlightRecorder
+from stagectl.profile import Profile
+from stagectl.record import Recorder, read_manifest
+from stagectl.retention import prune
+from stagectl.run_folder import reserve
+from stagectl.service import messages
+from stagectl.service.service_log import ServiceLog
+
+ARM, REQUEST, FAULT = "arm", "request", "fault"
+_PRUNE_EVERY_S = 600.0
+
+
+class Recording:
+    """The recorder of the session under way, and the reasons that begin and end its runs."""
+
+    def __init__(self, runs_root: Path, log: ServiceLog):
+        """No session yet."""
+        self._runs_root, self._log = runs_root, log
+        self._recorder: Recorder | FlightRecorder | None = None
+        self._over = threading.Event()
+        self._profile: Profile | None = None
+        self._pruning: threading.Thread | None = None
+
+    def factory(self, profile: Profile) -> Callable[[Path, dict[str, Any]], Recorder | FlightRecorder]:
+        """Return what makes the recorder of a session with this profile."""
+        self._profile = profile
+
+        def make(folder: Path, manifest: dict[str, Any]) -> Recorder | FlightRecorder:
+            if profile.record.when == "always":
+                self._recorder = Recorder(folder, {**manifest, "kept_by": "service"})
+            else:
+                self._recorder = FlightRecorder(
+                    folder,
+                    manifest,
+                    lambda name: reserve(self._runs_root, name),
+                    round(profile.record.flight_s * profile.cycle.rate_hz),
+                    profile.record.on_full_disk,
+                    lambda event, text: self._say(event, text),
+                )
+            return self._recorder
+
+        return make
+
+    def _say(self, event: str, text: str) -> None:
+        self._log.say(event, text)
+
+    @property
+    def _flight(self) -> FlightRecorder | None:
+        return self._recorder if isinstance(self._recorder, FlightRecorder) else None
+
+    def begin(self, name: str, trigger: str, t_ns: int) -> None:
+        """Begin a run where none is under way. Errors: RequestError where the disk does not take it."""
+        flight = self._flight
+        if flight is None or flight.run_folder is not None:
+            return
+        try:
+            flight.begin_run(f"service-{name}", trigger, t_ns)
+        except RecordError as error:
+            raise RequestError(f"{name}: nothing may move that can't be recorded: {error}") from error
+        if flight.run_folder is not None:
+            self._log.say("run", "begun", run=flight.run_folder.name, trigger=trigger)
+
+    def end(self, trigger: str, stop: str = "", text: str = "") -> None:
+        """End the run under way where `trigger` began it."""
+        flight = self._flight
+        if flight is None or flight.run_folder is None or flight.trigger != trigger:
+            return
+        try:
+            folder = flight.end_run({"stop": stop or "FINISHED", "text": text or "the stage rests without power"})
+        except RecordError as error:
+            self._log.say("record_lost", str(error))
+            return
+        self._log.say("run", "ended", run=folder.name if folder is not None else "", trigger=trigger)
+
+    def save_last(self, kind: str) -> None:
+        """Write the last seconds, where no run has them."""
+        flight = self._flight
+        if flight is None or flight.run_folder is not None:
+            return
+        try:
+            folder = flight.save_last(f"service-{FAULT}", kind)
+        except RecordError as error:
+            self._log.say("record_lost", str(error))
+            return
+        if folder is not None:
+            self._log.say("run", "the last seconds", run=folder.name, trigger=kind)
+
+    def folder(self, session: Path) -> Path:
+        """Return the run that rows go to now, the session's own folder where there is none."""
+        flight = self._flight
+        return session if flight is None or flight.run_folder is None else flight.run_folder
+
+    def message(self) -> messages.Recording | None:
+        """Say what goes to the disk now."""
+        recorder, flight = self._recorder, self._flight
+        if recorder is None:
+            return None
+        if flight is None:
+            return messages.Recording(
+                run=recorder.folder.name, trigger="always", rows_count=recorder.rows_count, trouble=""
+            )
+        run = flight.run_folder
+        return messages.Recording(
+            run="" if run is None else run.name,
+            trigger=flight.trigger,
+            rows_count=flight.run_rows_count,
+            trouble=flight.trouble,
+        )
+
+    def forget(self) -> None:
+        """The session is over."""
+        self._recorder = None
+
+    def discard(self, session: Path) -> None:
+        """Remove the folder of a session that did not come about, where it holds no row."""
+        self._recorder = None
+        try:
+            rows_count = read_manifest(session)["record"].get("rows_count", -1)
+        except RecordError:
+            return  # given back already, or not ours
+        if rows_count == 0:
+            shutil.rmtree(session, ignore_errors=True)
+
+    # ---- retention -------------------------------------------------------------------------------------------
+
+    def begin_pruning(self) -> None:
+        """Keep the runs within the profile's limits, from a thread of its own: removing takes time."""
+        self._pruning = threading.Thread(target=self._prune, name="retention", daemon=True)
+        self._pruning.start()
+
+    def end_pruning(self) -> None:
+        """Remove no more."""
+        self._over.set()
+
+    def _prune(self) -> None:
+        while True:
+            profile = self._profile
+            if profile is not None:
+                now_s = datetime.now(UTC).timestamp()
+                limits = profile.record
+                for gone in prune(self._runs_root, limits.size_limit_bytes, limits.age_limit_s, now_s):
+                    self._log.say("run_removed", gone.because, run=gone.folder.name)
+            if self._over.wait(_PRUNE_EVERY_S if profile is not None else 5.0):
+                return

@@ -1,0 +1,60 @@
+"""What survives a restart of the service: profile, world, and the backlash that was identified last, with its date.
+
+Homing does not: a stage that nobody watched may be anywhere.
+"""
+
+import json
+import os
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from stagectl.errors import RecordError
+from stagectl.service.messages import Backlash
+from stagectl.whole_file import replace_whole
+
+FILE = "service.json"
+
+
+class Remembered(BaseModel):
+    """The content of the file."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    profile: str = ""
+    """Path or name that the profile was read from."""
+    profile_name: str = ""
+    backend: str = ""
+    backlash: Backlash | None = None
+    faults_count: int = 0
+
+
+def state_folder() -> Path:
+    """Return where the file lies: $STATE_DIRECTORY (systemd), else below the user's state."""
+    given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    if given:
+        return Path(given)
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "stagectl"
+
+
+def recall(folder: Path) -> tuple[Remembered, str]:
+    """Return what was kept, and a remark where that can't be read: the service starts without it then."""
+    path = folder / FILE
+    try:
+        return Remembered.model_validate(json.loads(path.read_bytes())), ""
+    except FileNotFoundError:
+        return Remembered(), ""
+    except (OSError, ValueError, ValidationError) as error:
+        return Remembered(), f"{path}: can't be read ({type(error).__name__}); begun anew, identify the backlash again"
+
+
+def keep(folder: Path, remembered: Remembered) -> None:
+    """Write the file, whole or not at all. Errors: RecordError."""
+    path = folder / FILE
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        replace_whole(path, remembered.model_dump_json(indent=2).encode())
+    except OSError as error:
+        raise RecordError(
+            f"{path}: can't be kept: {error.strerror}; free space, or give another folder with --state"
+        ) from error

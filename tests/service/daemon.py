@@ -1,0 +1,105 @@
+"""A service in a process of its own, on the software rig, with everything that it leaves below one folder."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from stagectl.backend import ask_rig
+from stagectl.client import Client
+from stagectl.errors import LinkError
+from stagectl.profile import PROFILES_FOLDER
+from tests.toml_text import changed
+
+PATIENCE_S = 90.0
+REST_M_PER_S = 1e-3
+PATIENT = {  # limits that a busy test host does not pass
+    "trip.sensor_age_s": 0.3,
+    "trip.overrun_s": 0.3,
+    "trip.rpdo_deadline_s": 0.1,
+    "trip.heartbeat_s": 2.0,
+    "trip.lease_s": 3.0,
+}
+
+
+class Daemon:
+    """A service of its own, with everything that it leaves below one folder."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        (folder / "tmp").mkdir(parents=True)
+        profile = folder / "patient.toml"
+        profile.write_text(changed(PROFILES_FOLDER / "single-axis.toml", PATIENT))
+        self.socket = folder / "stage.socket"
+        self.state = folder / "state"
+        self.runs = folder / "runs"
+        command = [sys.executable, "-m", "stagectl.cli", "serve", str(profile), "--backend", "rig", "--tcp", "0"]
+        command += ["--socket", str(self.socket), "--state", str(self.state), "--runs", str(self.runs)]
+        self.notes = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self.notes.bind(str(folder / "notify"))
+        self.err = open(folder / "err", "w+")  # noqa: SIM115
+        self.process = subprocess.Popen(
+            command,
+            stderr=self.err,
+            stdout=subprocess.DEVNULL,
+            env={
+                **os.environ,
+                "TMPDIR": str(folder / "tmp"),
+                "NOTIFY_SOCKET": str(folder / "notify"),
+                "WATCHDOG_USEC": "1000000",
+            },
+        )
+        self.client = Client(self.socket)
+
+    def until(self, done, what):
+        """Ask again and again; fails after a while."""
+        give_up_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < give_up_s:
+            try:
+                if found := done():
+                    return found
+            except LinkError:
+                assert self.process.poll() is None, (self.folder / "err").read_text()
+            time.sleep(0.05)
+        raise AssertionError(f"{what}: {(self.folder / 'err').read_text()[-2000:]}")
+
+    def state_is(self, *states):
+        return self.until(lambda: self.client.status().state in states, f"state {states}")
+
+    @property
+    def plant(self):
+        """What is true of the stage now."""
+        (channel,) = (self.folder / "tmp").glob("stagectl-rig-*/can.socket")
+        return ask_rig(str(channel), {"state": True})["plant"]
+
+    @property
+    def tcp_port(self):
+        for line in (self.folder / "err").read_text().splitlines():
+            entry = json.loads(line)
+            if entry["event"] == "listening" and entry["text"].startswith("127.0.0.1:"):
+                return int(entry["text"].split(":")[1].split(",")[0])
+        raise AssertionError("no port")
+
+    def heard(self):
+        """Return what was said to systemd since the last call."""
+        said = []
+        while True:
+            try:
+                said.append(self.notes.recv(4096).decode())
+            except BlockingIOError:
+                return said
+
+    def end(self):
+        self.client.close()
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                self.process.wait(30.0)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        self.notes.close()
+        self.err.close()

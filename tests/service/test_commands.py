@@ -1,0 +1,142 @@
+"""The command line through a service: the same words, one stage, and who holds the lease."""
+
+import json
+import os
+import pty
+import subprocess
+import sys
+import time
+
+import pytest
+
+from stagectl import cli
+from stagectl.commands.jog_keys import FIRST_HOLD_S, NEXT_HOLD_S, Hand
+
+RIGHT, LEFT, UP = b"\x1b[C", b"\x1b[D", b"\x1b[A"
+
+
+@pytest.fixture
+def call(idle, capsys, monkeypatch):
+    """Run a command with --json against the daemon: (exit code, the object)."""
+    monkeypatch.setenv("STAGECTL_SOCKET", str(idle.socket))
+
+    def run(*arguments):
+        capsys.readouterr()
+        code = cli.main([*map(str, arguments), "--json"])
+        return code, json.loads(capsys.readouterr().out)
+
+    return run
+
+
+def test_commands_move_the_service_s_stage_and_leave_it_without_power(idle, call):
+    code, answer = call("move", "--target-m", 0.03)
+    assert (code, answer["finished"], answer["stop"]) == (0, True, "FINISHED")
+    assert answer["banner"].startswith("SOFTWARE RIG")
+    assert answer["end_position_m"] == pytest.approx(0.03, abs=1e-4)
+    code, answer = call("jog", "--distance-m", -0.01)
+    assert code == 0
+    assert answer["end_position_m"] == pytest.approx(0.02, abs=1e-3)  # it was without power in between
+    idle.state_is("idle")
+    code, answer = call("status")
+    assert (code, answer["state"], answer["homed"], answer["fault"]) == (0, "idle", True, None)
+    assert answer["limits"]["travel_m"] == [-0.15, 0.15]
+
+
+def test_what_can_t_be_is_refused_with_its_place_and_remedy(call):
+    code, answer = call("move", "--target-m", 3.0)
+    assert code == 2
+    assert "target_m is 3: the travel of" in answer["error"]["message"]
+    code, answer = call("move", "--target-m", "nan")
+    assert code == 2
+    assert "--target-m is nan" in answer["error"]["message"]
+    code, answer = call("jog", "--distance-m", 0.01, "--profile", "kang-2023")
+    assert code == 2
+    assert "the service has" in answer["error"]["message"]
+    code, answer = call("home", "--backend", "hardware")
+    assert code == 2
+    assert "change that with `stagectl backend`" in answer["error"]["message"]
+    code, answer = call("jog", "--keys")
+    assert code == 2
+    assert "needs a terminal" in answer["error"]["message"]
+
+
+def test_a_lease_that_somebody_holds_is_worked_under_or_respected(idle, call):
+    with idle.client.lease("anna") as taken:
+        code, answer = call("lease")
+        assert (code, answer["lease"]["holder"]) == (0, "anna")
+        code, answer = call("move", "--target-m", 0.0)
+        assert code == 2
+        assert "anna holds the lease" in answer["error"]["message"]
+        code, answer = call("move", "--target-m", 0.0, "--lease", taken.token)
+        assert (code, answer["state"]) == (0, "armed")
+        code, answer = call("stop")
+        assert (code, answer["state"]) == (0, "idle")
+
+
+def test_the_rest_says_what_it_found(call):
+    code, answer = call("fault")
+    assert (code, answer["fault"]) == (0, None)
+    code, answer = call("backend")
+    assert (code, answer["backend"]) == (0, "rig")
+    code, answer = call("backend", "rig")
+    assert (code, answer["backend"]) == (0, "rig")
+    code, answer = call("log", "--lines", 5)
+    assert code == 0
+    assert len(answer["entries"]) == 5
+
+
+def test_without_a_service_there_is_nothing_to_ask(call, monkeypatch, tmp_path):
+    monkeypatch.setenv("STAGECTL_SOCKET", str(tmp_path / "none"))
+    for command in (["status"], ["stop"], ["fault"], ["lease"], ["backend"], ["log"], ["watch"]):
+        code, answer = call(*command)
+        assert code == 3
+        assert "is `stagectl serve` running?" in answer["error"]["message"]
+
+
+def test_keys_jog_while_they_are_held(idle):
+    before_m = idle.plant["macro_position_m"]
+    leader, follower = pty.openpty()
+    command = [sys.executable, "-m", "stagectl.cli", "jog", "--keys", "--velocity-m-per-s", "0.02"]
+    jogging = subprocess.Popen(
+        [*command, "--socket", str(idle.socket)], stdin=follower, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    os.close(follower)
+    try:
+        idle.state_is("armed")
+        until_s = time.monotonic() + 1.5
+        while time.monotonic() < until_s:
+            os.write(leader, LEFT)
+            time.sleep(0.05)
+        idle.state_is("armed")  # let go of: the jog is over, and the stage holds
+        moved_m = idle.plant["macro_position_m"] - before_m
+        os.write(leader, b"q")
+        assert jogging.wait(30.0) == 0, jogging.stderr.read()
+    finally:
+        jogging.kill()
+        jogging.communicate()
+        os.close(leader)
+    assert -0.06 < moved_m < -0.01
+
+
+def test_a_hand_holds_goes_on_turns_and_lets_go():
+    hand = Hand(0.01, 0.03)
+    assert hand.wanted_m_per_s(0.0) == 0.0
+    hand.press(RIGHT, 0.0)
+    assert hand.wanted_m_per_s(FIRST_HOLD_S - 1e-6) == 0.01
+    assert hand.wanted_m_per_s(FIRST_HOLD_S) == 0.0
+    hand.press(RIGHT, 0.5)
+    hand.press(RIGHT, 0.55)
+    assert hand.wanted_m_per_s(0.55 + NEXT_HOLD_S - 1e-6) == 0.01
+    assert hand.wanted_m_per_s(0.55 + NEXT_HOLD_S) == 0.0
+    hand.press(LEFT, 0.6)
+    assert hand.wanted_m_per_s(0.6) == -0.01
+    hand.press(UP, 0.6)
+    assert hand.wanted_m_per_s(0.6) == -0.02
+    hand.press(UP + UP, 0.6)
+    assert hand.wanted_m_per_s(0.6) == -0.03
+    hand.press(b" ", 0.6)
+    assert hand.wanted_m_per_s(0.6) == 0.0
+    assert not hand.leaves
+    hand.press(RIGHT + b"q", 0.7)
+    assert hand.leaves
+    assert hand.wanted_m_per_s(0.7) == 0.0

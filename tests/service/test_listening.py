@@ -1,0 +1,130 @@
+"""Sockets, tokens, systemd and the state file: what stands between the service and everybody else on the machine."""
+
+import json
+import os
+import socket
+import stat
+
+import pytest
+
+from stagectl.errors import LinkError, ProfileError, RecordError, RequestError
+from stagectl.service import messages
+from stagectl.service.access import Role, read_tokens, role_of
+from stagectl.service.notify import Notifier
+from stagectl.service.places import is_served, listen_tcp, listen_unix
+from stagectl.service.remembered import FILE, Remembered, keep, recall
+
+
+def test_the_socket_is_for_owner_and_group(tmp_path):
+    path = tmp_path / "run" / "stage.socket"
+    listening = listen_unix(path)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o660
+    assert is_served(path)
+    with pytest.raises(LinkError, match="a service listens here already; stop it"):
+        listen_unix(path)
+    listening.close()
+    assert not is_served(path)
+    listen_unix(path).close()  # a dead service's socket is no obstacle
+
+
+def test_a_folder_of_everybody_is_refused(tmp_path):
+    tmp_path.chmod(0o777)
+    with pytest.raises(LinkError, match="others may put a socket of theirs here"):
+        listen_unix(tmp_path / "stage.socket")
+
+
+def test_tcp_is_loopback_only():
+    listening = listen_tcp(0)
+    host, port = listening.getsockname()
+    assert host == "127.0.0.1"
+    with pytest.raises(LinkError, match=f"127.0.0.1:{port}: can't listen: Address already in use"):
+        listen_tcp(port)
+    listening.close()
+    with pytest.raises(RequestError, match="--tcp 70000: a port is a number"):
+        listen_tcp(70000)
+
+
+def test_tokens_are_made_once_and_are_nobody_elses(tmp_path):
+    path = tmp_path / "tokens"
+    tokens = read_tokens(path)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert read_tokens(path) == tokens
+    assert role_of(tokens, tokens[Role.OBSERVE]) is Role.OBSERVE
+    assert role_of(tokens, tokens[Role.OPERATE]) is Role.OPERATE
+    for wrong in ("", tokens[Role.OPERATE][:-1], tokens[Role.OPERATE] + "x", "\udcff", "ä" * 30):
+        assert role_of(tokens, wrong) is None
+    path.chmod(0o640)
+    with pytest.raises(ProfileError, match="mode 0640, others may read it; chmod 600"):
+        read_tokens(path)
+
+
+@pytest.mark.parametrize("text", ["", "operate short\n", "operate " + "a" * 30 + "\n", "observe {0}\noperate {0}\n"])
+def test_a_tokens_file_that_lets_anybody_in_is_refused(tmp_path, text):
+    path = tmp_path / "tokens"
+    path.write_text(text.format("b" * 30))
+    path.chmod(0o600)
+    with pytest.raises(ProfileError, match="needs a line 'ROLE TOKEN'"):
+        read_tokens(path)
+
+
+def test_systemd_hears_what_there_is_to_hear(tmp_path):
+    place = tmp_path / "notify"
+    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+    manager.bind(str(place))
+    now_s = [0.0]
+    notifier = Notifier({"NOTIFY_SOCKET": str(place), "WATCHDOG_USEC": "2000000"}, lambda: now_s[0])
+
+    def heard():
+        said = []
+        while True:
+            try:
+                said.append(manager.recv(4096).decode())
+            except BlockingIOError:
+                return said
+
+    notifier.say(READY=1, STATUS="waiting:\nfor CAN")
+    assert heard() == ["READY=1\nSTATUS=waiting: for CAN"]
+    notifier.feed(1000)
+    assert heard() == ["WATCHDOG=1"]
+    notifier.feed(1001)  # news, but too soon after the last
+    now_s[0] = 0.6
+    notifier.feed(1000)  # time, but the servo stands still
+    assert heard() == []
+    notifier.feed(1002)
+    assert heard() == ["WATCHDOG=1"]
+    now_s[0] = 100.0
+    for _ in range(5):
+        notifier.feed(1002)
+    assert heard() == []
+    notifier.allow(240.0)
+    notifier.allow(0.0)
+    assert heard() == ["WATCHDOG=1\nWATCHDOG_USEC=240000000", "WATCHDOG=1\nWATCHDOG_USEC=2000000"]
+    manager.close()
+    notifier.say(STATUS="nobody listens")
+
+
+def test_without_systemd_nothing_is_said():
+    notifier = Notifier({})
+    notifier.say(READY=1)
+    notifier.feed(1)
+    assert notifier.watchdog_us == 0
+
+
+def test_the_state_survives_and_a_damaged_one_is_said(tmp_path):
+    backlash = messages.Backlash(
+        width_m=2e-4, centre_m=1e-5, left_m=9e-5, right_m=1.1e-4, left_stiffness_n_per_m=1e4,
+        right_stiffness_n_per_m=1.2e4, width_sd_m=1e-7, at="2026-11-22T02:00:00+00:00", run="r", profile_name="p",
+    )  # fmt: skip
+    remembered = Remembered(profile="/etc/stagectl/p.toml", profile_name="p", backend="rig", backlash=backlash)
+    assert recall(tmp_path) == (Remembered(), "")
+    keep(tmp_path / "deep", remembered)
+    assert recall(tmp_path / "deep") == (remembered, "")
+    path = tmp_path / "deep" / FILE
+    for damage in ("{", "[]", json.dumps({"profile": 3}), json.dumps({"homed": True})):
+        path.write_text(damage)
+        found, remark = recall(tmp_path / "deep")
+        assert found == Remembered()
+        assert "can't be read" in remark
+    assert sorted(os.listdir(tmp_path / "deep")) == [FILE]
+    with pytest.raises(RecordError, match="can't be kept"):
+        keep(path, remembered)

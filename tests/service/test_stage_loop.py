@@ -1,0 +1,280 @@
+"""The stage's thread on the rig in virtual time: faults, what leads out of them, refusals, worlds that are missing."""
+
+import time
+
+import pytest
+
+from sim_backend.faults import Fault
+from stagectl.errors import RequestError
+from stagectl.profile import PROFILES_FOLDER
+from stagectl.service import messages
+from stagectl.service.desk import Busy, Desk, Ending, Unfit
+from stagectl.service.exposition import Figures
+from stagectl.service.lease import LeaseRefused
+from stagectl.service.notify import Notifier
+from stagectl.service.remembered import Remembered, recall
+from stagectl.service.service_log import ServiceLog
+from stagectl.service.stage_loop import Settings, StageLoop
+from stagectl.signals import Stop
+from tests.toml_text import changed
+
+PATIENCE_S = 60.0
+
+
+class Bench:
+    """A loop in virtual time, driven step by step, and one operator."""
+
+    def __init__(self, folder, profile="single-axis", backend="batch"):
+        self.log = ServiceLog(None)
+        self.now_s = 0.0
+        self.desk = Desk(self.log, lambda: self.now_s)
+        self.figures = Figures()
+        self.settings = Settings(profile, backend, folder / "runs", folder / "state")
+        self.loop = StageLoop(self.settings, self.desk, self.log, Remembered(), Notifier({}), self.figures)
+        self.token = ""
+        self.keys = 0
+
+    @property
+    def status(self):
+        return self.desk.status()
+
+    def until(self, done):
+        """Step until `done`."""
+        give_up_s = time.monotonic() + PATIENCE_S
+        while not done():
+            assert time.monotonic() < give_up_s, self.status
+            self.loop.step()
+
+    def take(self):
+        self.token = self.desk.take_lease(messages.TakeLease(holder="anna", duration_s=30.0)).token
+
+    def begin(self, name, body):
+        self.keys += 1
+        return self.desk.submit(name, body, f"k{self.keys}", self.token).key
+
+    def do(self, name, body):
+        """Submit and carry out; returns the finished command."""
+        key = self.begin(name, body)
+        self.until(lambda: self.desk.command(key).state in ("done", "failed"))
+        self.loop.step()
+        return self.desk.command(key)
+
+    def inject(self, *faults):
+        backend = self.loop._stage.backend
+        for fault in faults:
+            backend.rig.inject(fault, backend.wire.t_ns)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    made = Bench(tmp_path_factory.mktemp("service"))
+    made.until(lambda: made.loop._state == "idle")
+    yield made
+    made.loop.leave()
+    made.loop.run()
+    assert made.status.state in ("off", "fault")
+
+
+@pytest.fixture
+def armed(bench):
+    """The bench with a lease, homed and armed; at the end without."""
+    bench.take()
+    if not bench.status.homed:
+        assert bench.do("home", messages.Home()).stop == "FINISHED"
+    if bench.status.state == "idle":
+        assert bench.do("arm", messages.Arm()).stop == "FINISHED"
+    assert bench.status.state == "armed"
+    yield bench
+    bench.now_s += 100.0
+    bench.until(lambda: not bench.desk.powered)
+    bench.loop.step()
+    if (fault := bench.status.fault) is not None:
+        bench.take()
+        assert bench.do("acknowledge", messages.Acknowledge(number=fault.number)).state == "done"
+    bench.now_s += 100.0
+    bench.until(lambda: bench.status.state == "idle")
+
+
+def test_nothing_moves_without_a_lease(bench):
+    for name, body in (
+        ("arm", messages.Arm()),
+        ("home", messages.Home()),
+        ("move", messages.Move(target_m=0.0)),
+        ("backend", messages.SwapBackend(backend="rig")),
+    ):
+        with pytest.raises(LeaseRefused, match="nobody holds the lease"):
+            bench.desk.submit(name, body, "k", "")
+        with pytest.raises(LeaseRefused):
+            bench.desk.submit(name, body, "k", "guessed")
+    with pytest.raises(LeaseRefused):
+        bench.desk.jog_at(messages.JogAt(velocity_m_per_s=0.1), "guessed")
+    bench.loop.step()
+    assert bench.status.state == "idle"
+
+
+def test_moves_hold_and_are_refused_where_they_must(armed):
+    assert armed.do("move", messages.Move(target_m=0.01)).stop == "FINISHED"
+    assert armed.status.positions.end_position_m == pytest.approx(0.01, abs=1e-4)
+    assert armed.do("jog", messages.JogBy(distance_m=-0.02)).stop == "FINISHED"
+    assert armed.status.positions.end_position_m == pytest.approx(-0.01, abs=1e-4)
+    with pytest.raises(Unfit, match=r"target_m is 50: the travel of single-axis is .* give a position within it"):
+        armed.begin("move", messages.Move(target_m=50.0))
+    with pytest.raises(Unfit, match="no micro"):
+        armed.begin("identify", messages.Identify())
+    with pytest.raises(RequestError, match="arm is not possible in state armed: possible are"):
+        armed.begin("arm", messages.Arm())
+    failed = armed.do("jog", messages.JogBy(distance_m=0.9 * armed.desk.profile.macro.travel_m[1] * 2))
+    assert failed.state == "failed"
+    assert "the travel" in failed.error.message
+    assert armed.status.state == "armed"
+
+
+def test_the_same_key_is_the_same_command(armed):
+    body = messages.JogBy(distance_m=0.001)
+    begun = armed.desk.submit("jog", body, "once", armed.token)
+    assert armed.desk.submit("jog", body, "once", armed.token).key == begun.key
+    with pytest.raises(Busy, match="jog is under way; wait for its end, or stop it"):
+        armed.desk.submit("jog", body, "twice", armed.token)
+    armed.until(lambda: armed.desk.command("once").state == "done")
+    armed.loop.step()
+    at_m = armed.status.positions.setpoint_position_m
+    assert armed.desk.submit("jog", body, "once", armed.token).state == "done"
+    for _ in range(5):
+        armed.loop.step()
+    assert armed.status.positions.setpoint_position_m == at_m
+    with pytest.raises(Unfit, match="key 'once' was used for another jog"):
+        armed.desk.submit("jog", messages.JogBy(distance_m=0.002), "once", armed.token)
+
+
+def test_a_stop_ends_what_is_under_way_and_what_waits(armed):
+    key = armed.begin("move", messages.Move(target_m=0.05))
+    armed.desk.ask_to_stop("test")
+    assert armed.desk.command(key).state == "failed"
+    armed.loop.step()
+    assert armed.status.state == "stopping" or not armed.desk.powered
+    armed.loop.step()
+    assert armed.status.state == "idle"
+    assert armed.do("arm", messages.Arm()).stop == "FINISHED"
+    key = armed.begin("move", messages.Move(target_m=0.05))
+    before = armed.loop._progress
+
+    def then_stop(what, share):
+        if share > 0.3:
+            armed.desk.ask_to_stop("in the middle")
+        before(what, share)
+
+    armed.loop._stage._progress = then_stop
+    armed.until(lambda: armed.desk.command(key).state == "done")
+    armed.loop._stage._progress = before
+    assert armed.desk.command(key).stop == "OPERATOR"
+    armed.loop.step()
+    armed.loop.step()
+    assert armed.status.state == "idle"
+    assert 0.0 < abs(armed.status.positions.end_position_m) < 0.05
+
+
+def test_a_lease_that_runs_out_stops_the_stage_and_is_a_fault(armed):
+    armed.now_s += 31.0
+    with pytest.raises(LeaseRefused, match="still coming to rest"):
+        armed.take()
+    armed.until(lambda: armed.status.state == "fault")
+    fault = armed.status.fault
+    assert (fault.kind, fault.state) == (Stop.LEASE.name, "armed")
+    assert "the lease on motion ran out" in fault.what
+    assert "ms ago" in fault.values
+    assert fault.remedy
+    armed.take()
+    with pytest.raises(RequestError, match="not possible in state fault: look at the fault"):
+        armed.begin("arm", messages.Arm())
+    refused = armed.do("acknowledge", messages.Acknowledge(number=fault.number + 1))
+    assert "is not the newest" in refused.error.message
+    assert armed.do("acknowledge", messages.Acknowledge(number=fault.number)).state == "done"
+    assert (armed.status.state, armed.status.fault) == ("idle", None)
+    assert not armed.desk.powered
+    assert armed.do("arm", messages.Arm()).stop == "FINISHED"
+
+
+def test_a_client_that_vanishes_in_mid_motion_stops_it(armed):
+    before = armed.loop._progress
+
+    def then_vanish(what, share):
+        if share > 0.3:
+            armed.now_s += 31.0
+        before(what, share)
+
+    armed.loop._stage._progress = then_vanish
+    key = armed.begin("move", messages.Move(target_m=0.1))
+    armed.until(lambda: armed.desk.command(key).state == "done")
+    armed.loop._stage._progress = before
+    armed.loop.step()
+    assert armed.desk.command(key).stop == Stop.LEASE.name
+    assert (armed.status.fault.kind, armed.status.fault.state) == (Stop.LEASE.name, "moving")
+    assert armed.status.positions.end_position_m < 0.09
+
+
+def test_a_lost_beam_is_a_fault_and_voids_the_homing(armed):
+    armed.inject(Fault("beam_loss", duration_s=0.3, axis="both"))
+    armed.until(lambda: armed.status.state == "fault")
+    fault = armed.status.fault
+    assert fault.kind in (Stop.SENSOR_AGE.name, Stop.REFERENCE_LOST.name)
+    number = fault.number
+    assert armed.do("acknowledge", messages.Acknowledge(number=number)).state == "done"
+    assert not armed.status.homed
+    refused = armed.do("arm", messages.Arm())
+    assert "not homed since it was connected; home it first" in refused.error.message
+    assert armed.status.state == "idle"
+    assert armed.do("home", messages.Home()).stop == "FINISHED"
+    assert armed.status.homed
+    assert recall(armed.settings.state_folder)[0].faults_count >= number
+
+
+def test_what_clients_see_is_counted(armed):
+    text = armed.figures.exposition(armed.status).decode()
+    assert 'stagectl_state{state="armed"} 1.0' in text
+    assert f"stagectl_cycles_total {float(armed.figures._cycles)}" in text
+    assert f'stagectl_cycle_lateness_seconds_bucket{{le="+Inf"}} {float(armed.figures._cycles)}' in text
+    assert 'stagectl_backend{backend="batch"} 1.0' in text
+    samples = armed.desk.scope.after(0)
+    assert len(samples.rows) > 10
+    assert samples.rows[-1][1] == pytest.approx(armed.status.positions.end_position_m, abs=1e-3)
+    assert armed.desk.scope.after(samples.last).rows == []
+
+
+def test_hardware_that_is_not_there_is_waited_for(tmp_path):
+    bench = Bench(tmp_path, backend="hardware")
+    bench.loop.step()
+    status = bench.status
+    assert (status.state, status.backend) == ("off", "hardware")
+    assert "not there; plug it in" in status.waiting_for
+    assert status.banner.startswith("HARDWARE")
+    bench.take()
+    with pytest.raises(RequestError, match="not possible in state off"):
+        bench.begin("home", messages.Home())
+    key = bench.begin("backend", messages.SwapBackend(backend="rig"))
+    bench.loop.step()
+    assert bench.desk.command(key).text.startswith("SOFTWARE RIG")
+    bench.loop._tick()
+    assert bench.status.banner.startswith("SOFTWARE RIG")
+    bench.desk.close()
+    with pytest.raises(Ending):
+        bench.begin("home", messages.Home())
+
+
+def test_a_profile_edited_to_nonsense_changes_nothing(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(changed(PROFILES_FOLDER / "single-axis.toml", {}))
+    bench = Bench(tmp_path, profile=str(path))
+    bench.until(lambda: bench.loop._state == "idle")
+    stage = bench.loop._stage
+    path.write_text("name = 3\n")
+    bench.loop.reread()
+    bench.loop.step()
+    bench.loop.step()
+    assert bench.loop._stage is stage
+    assert "kept as it was" in bench.log.last(1)[0].text
+    path.write_text(changed(PROFILES_FOLDER / "single-axis.toml", {"macro.velocity_limit_m_per_s": 0.05}))
+    bench.loop.reread()
+    bench.until(lambda: bench.loop._state == "idle" and bench.loop._stage is not stage)
+    assert bench.desk.profile.macro.velocity_limit_m_per_s == 0.05
+    bench.loop.leave()
+    bench.loop.run()
