@@ -14,16 +14,18 @@ if TYPE_CHECKING:
         gap,
         gap_demo,
         gap_next,
+        jog_keys,
         motion,
         planning,
         profiles,
+        remote,
         reproduce,
         runs,
+        serve,
         tune,
     )
 
 __all__ = [
-    "__all__",
     "budget",
     "demo",
     "gap",

@@ -80,10 +80,8 @@ def _rules(law: str) -> list[str]:
     if law == "pid":
         return ["PID has one number, its bandwidth; gains follow from it as `stagectl/laws/pid.py` says."]
     return [
-        "The sliding surface is critically damped and a little slower than the sliding gain: eta = 0.75 k / m, "
-        "gamma = eta² / 4.",
-        "The observer reckons with more force than there is, so that it takes no margin from the law (Doyle and "
-        "Stein, 1979).",
-        "The sliding gain is the number that was searched; its margins hold up to the adaptive gain's ceiling "
-        "(adapted).",
+        "The law is two octaves faster than the loop is to be: k / m = 3.75 w, eta = 3.4 w; its integral is slow: "
+        "2 gamma / eta = w / 8. It acts on a prediction, so that it adds little noise of its own.",
+        "The observer decides: the drift density of its unknown force sets margin and stiffness, and is the number "
+        "that was searched; its margins hold up to the adaptive gain's ceiling (adapted).",
     ]

@@ -1,10 +1,10 @@
 """Gains with a stated bandwidth and margin, from the linearised loop of the identified machine.
 
-DSMC. The sliding surface is critically damped and a little slower than the sliding gain: eta = 0.75 k / m, gamma =
-eta^2 / 4. The observer reckons with more force than there is, a walk up to a quarter of the cycle rate and white up to
-the whole of it, so that it takes no margin from the law (Doyle, Stein, IEEE TAC 24(4), 1979). What is left is one
-number, the sliding gain: it is made as large as the margins allow, the adaptive gain at its ceiling included, or as
-the bandwidth that is asked for takes. PID has its bandwidth as that one number.
+DSMC. The law is two octaves faster than the loop is to be, k / m = 3.75 w and eta = 3.4 w, with a slow integral,
+2 gamma / eta = w / 8. It acts on a prediction, so that the observer behind the prediction decides: the drift density of its
+unknown force is the one number left, and sets margin and stiffness together. It is made as large as the margins allow,
+the adaptive gain at its ceiling included, or as the bandwidth that is asked for takes. PID has its bandwidth as that
+one number.
 
 Every result is checked in the gap and in contact on either side, and with the moved mass 10 % off.
 """
@@ -31,8 +31,8 @@ CEILING = "gap, adapted"
 """With the adaptive gain at its ceiling."""
 MASS_RATIO = 0.1
 
-_ETA_RATIO = 0.75
-_WALK_RATIO, _WHITE_RATIO = 0.25, 1.0  # of the cycle rate: up to where the observer reckons with forces
+_RATE_RATIO = 0.048  # of the cycle rate: w, where no bandwidth is asked for
+_RATIOS = {"eta_ratio": 3.4, "gamma_ratio": 0.22, "sliding_ratio": 3.75}  # in w
 _SPAN = (1e-2, 1e2)  # of the profile's own number, searched
 _GRID_COUNT = 13
 _BISECTIONS = 7
@@ -103,7 +103,7 @@ def tuned(
     """
     say("judging the gains as they are", 0.0)
     before = assessed(profile, law)
-    fixed, key = _rule(profile, law)
+    fixed, key = _rule(profile, law, asked)
     at = profile.model_copy(update={"control": profile.control.model_copy(update=fixed)})
     say("searching", 0.2)
     value = _searched(at, law, key, asked)
@@ -165,22 +165,13 @@ def _heavier(body: Body, profile: "Profile", ratio: float) -> Body:
     return replace(body, parameters=parameters)
 
 
-def _rule(profile: "Profile", law: str) -> tuple[dict[str, float], str]:
+def _rule(profile: "Profile", law: str, asked: Asked) -> tuple[dict[str, float], str]:
     """Return the gains that the rules fix, and the key of the one that is searched."""
     axis = profile.axes[-1]
     if law == "pid":
         return {}, "pid_bandwidth_hz" if profile.micro is not None else "macro_bandwidth_hz"
-    noise = profile.axis(axis).mass_kg * profile.interferometer.noise_m * math.sqrt(profile.cycle.period_s)
-    rate_per_s = 2.0 * math.pi * profile.cycle.rate_hz
-    fixed = {
-        "eta_ratio": _ETA_RATIO,
-        "gamma_ratio": 0.25 * _ETA_RATIO**2,
-        "sliding_ratio": 1.0,
-        f"{axis}_drift_n_per_sqrt_s": float(f"{(_WALK_RATIO * rate_per_s) ** 3 * noise:.3g}"),
-    }
-    if axis == "micro":
-        fixed["micro_white_n_sqrt_s"] = float(f"{(_WHITE_RATIO * rate_per_s) ** 2 * noise:.3g}")
-    return fixed, f"{axis}_bandwidth_hz"
+    w_hz = _RATE_RATIO * profile.cycle.rate_hz if asked.bandwidth_hz is None else asked.bandwidth_hz
+    return {f"{axis}_bandwidth_hz": float(f"{w_hz:.4g}"), **_RATIOS}, f"{axis}_drift_n_per_sqrt_s"
 
 
 def _with(profile: "Profile", key: str, value: float) -> "Profile":
