@@ -1,10 +1,10 @@
 """Gains with a stated bandwidth and margin, from the linearised loop of the identified machine.
 
 DSMC. The law is two octaves faster than the loop is to be, k / m = 3.75 w and eta = 3.4 w, with a slow integral,
-2 gamma / eta = w / 8. It acts on a prediction, so that the observer behind the prediction decides: the drift density of its
-unknown force is the one number left, and sets margin and stiffness together. It is made as large as the margins allow,
-the adaptive gain at its ceiling included, or as the bandwidth that is asked for takes. PID has its bandwidth as that
-one number.
+2 gamma / eta = w / 8. It acts on a prediction, so that the observer behind the prediction decides: the drift density
+of its unknown force is the one number left, and sets margin and stiffness together. It is made as large as the margins
+allow, the adaptive gain at its ceiling included, or as the bandwidth that is asked for takes. PID has its bandwidth as
+that one number.
 
 Every result is checked in the gap and in contact on either side, and with the moved mass 10 % off.
 """
