@@ -46,7 +46,9 @@ def test_every_part_changes_a_state_of_its_own(oled_profile):
             (name, field)
             for name, value in controller.snapshot().items()
             for field in (value.dtype.names or ("",))
-            if not np.array_equal(value[field] if field else value, fresh[name][field] if field else fresh[name])
+            if not np.array_equal(
+                value[field] if field else value, fresh[name][field] if field else fresh[name], equal_nan=True
+            )
         )
         assert one.asked_fed or changed
         assert (changed, one.asked_fed) not in seen
