@@ -1,0 +1,106 @@
+"""What laws of the gap workflow run along: motion foretold from the past, a joint that lets go, readings in time."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stagectl.effects import CATALOGUE
+from stagectl.gap import balance
+from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
+from stagectl.gap.log import Log
+from stagectl.gap.motion import motion_of, motion_under
+from stagectl.gap.settling import settled_by
+
+H, MASS_KG, NOISE_M = 1e-3, 40.0, 5e-9
+COUNT = 4000
+T_S = np.arange(COUNT) * H
+W = 2.0 * np.pi * 1.3
+
+
+def _swing(t_s: np.ndarray) -> np.ndarray:
+    """20 mm at 1.3 Hz, in closed form."""
+    return 0.02 * np.sin(W * t_s)
+
+
+def _axis_log(read_m: np.ndarray, start_s: float = 0.0) -> Log:
+    command_n = -MASS_KG * W * W * _swing(T_S + 0.5 * H)
+    return Log("run", H, read_m, command_n, np.ones(COUNT, bool), "1", start_s=start_s)
+
+
+AXIS = Believed("axis", H, BelievedAxis(MASS_KG, 0.4, NOISE_M, 0.0))
+
+
+def test_what_a_law_runs_along_holds_nothing_of_later_samples():
+    random = np.random.default_rng(3)
+    seen_m = _swing(T_S) + NOISE_M * random.standard_normal(COUNT)
+    later_m, cut = seen_m.copy(), 3000
+    later_m[cut:] += 3.0 * NOISE_M * random.standard_normal(COUNT - cut)
+    force_n = np.repeat((-MASS_KG * W * W * _swing(T_S + 0.5 * H))[:, None], 4, axis=1)
+    rough = motion_of(seen_m, H, NOISE_M)
+    valid = np.ones(COUNT, bool)
+    first, second = (motion_under(rough, m, valid, force_n, MASS_KG, H, NOISE_M) for m in (seen_m, later_m))
+    for name in ("position_m", "velocity_m_per_s", "acceleration_m_per_s2"):
+        assert np.array_equal(getattr(first, name)[:cut], getattr(second, name)[:cut]), name
+    # a sample is foretold before it is seen: its own change is not in what is foretold for it
+    assert np.array_equal(first.at_samples[: cut + 1, :2], second.at_samples[: cut + 1, :2])
+    assert not np.array_equal(first.at_samples[cut + 2 :, :2], second.at_samples[cut + 2 :, :2])
+
+
+@pytest.mark.parametrize("start_s", [0.0, 140.0])
+def test_readings_of_a_skewed_clock_are_put_where_they_were_taken(start_s):
+    """27 ppm are 3.9 ms after 144 s: at 1.3 Hz two terms of a series miss by 0.11 um, and 0.6 mm are moved."""
+    late_s = 27e-6 * (start_s + T_S)
+    random = np.random.default_rng(5)
+    recording = balance.recording_of(
+        _axis_log(_swing(T_S + late_s) + NOISE_M * random.standard_normal(COUNT), start_s), AXIS
+    )
+    skew = CATALOGUE["clock_skew"]
+    there = balance.operating_point(recording, [(skew, "macro_sensor", {"skew_ppm": 27.0})])
+    off_m = there.log.macro_position_m - _swing(T_S)
+    assert np.std(off_m[400:-20]) < 1.2 * NOISE_M
+    error_m = balance.reading_error_m(recording, skew, "macro_sensor", [27.0], whole=True)[:, 0]
+    moved_m = _swing(T_S + late_s) - _swing(T_S)
+    assert np.max(np.abs(error_m - moved_m)[400:-20]) < 1e-4 * np.max(np.abs(moved_m)) + NOISE_M
+
+
+JOINT = BelievedJoint(
+    spring_n_per_m=500.0, damping_n_s_per_m=5.0, left_m=180e-6, right_m=30e-6,
+    left_stiffness_n_per_m=10e3, right_stiffness_n_per_m=13e3, width_sd_m=0.3e-6, stiffness_sd_ratio=0.01,
+    damping_sd_ratio=0.1, left_stiffness_sd_ratio=0.01, right_stiffness_sd_ratio=0.01,
+)  # fmt: skip
+DAMPING = {"name": "contact_damping", "acts_on": "contact", "damping_n_s_per_m": 90.0}
+STAGE = dataclasses.replace(AXIS, micro=BelievedAxis(MASS_KG, 0.4, NOISE_M, 0.0), joint=JOINT, effects=(DAMPING,))
+
+
+@pytest.fixture(scope="module")
+def touching():
+    """A stage that swings 60 um beyond its right edge, twice a second."""
+    apart_m = 80e-6 * np.sin(2.0 * np.pi * 2.0 * T_S)  # macro minus end
+    zeros = np.zeros(COUNT)
+    log = Log("run", H, apart_m, zeros, np.ones(COUNT, bool), "1", end_position_m=zeros, micro_command_n=zeros)
+    return balance.recording_of(log, STAGE)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [("soft_contact", [25e-6]), ("contact_damping", [400.0]), ("contact_hysteresis", [0.5, 1e-5])],
+)
+def test_a_contact_never_pulls_whatever_is_added_at_its_size(touching, name, parameters):
+    believed_n = balance.known_forces(touching).end_n - (
+        JOINT.spring_n_per_m * (touching.macro.position_m - touching.end.position_m)
+        + JOINT.damping_n_s_per_m * (touching.macro.velocity_m_per_s - touching.end.velocity_m_per_s)
+    )
+    at_size = balance.effect_forces(touching, CATALOGUE[name], "contact", parameters, whole=True)
+    first_order = balance.effect_forces(touching, CATALOGUE[name], "contact", parameters)
+    assert np.min(believed_n + first_order.end_n) < -0.01
+    assert np.min(believed_n + at_size.end_n) > -1e-12
+    assert np.array_equal(at_size.macro_n, -at_size.end_n)
+
+
+def test_what_the_joint_was_settled_by_is_known(touching):
+    there = balance.with_joint_changed(touching, 0.2e-6, -0.1e-6, 0.05)
+    found = settled_by(STAGE, there)
+    assert found == pytest.approx({"left_m": 0.2e-6, "right_m": -0.1e-6, "contact_damping on contact": 0.05})
+    assert there.believed.effects[0]["damping_n_s_per_m"] == pytest.approx(94.5)
+    assert np.max(there.penetration_m) == pytest.approx(np.max(touching.penetration_m) + 0.1e-6, rel=1e-3)
