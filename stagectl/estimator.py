@@ -86,20 +86,16 @@ def belief(profile: "Profile") -> np.ndarray:
     return q
 
 
-def kalman_gains(
-    mass_kg: float, period_s: float, noise_m: float, drift_n_per_sqrt_s: float, white_n_sqrt_s: float = 0.0
-) -> np.ndarray:
+def kalman_gains(mass_kg: float, period_s: float, noise_m: float, drift_n_per_sqrt_s: float) -> np.ndarray:
     """Return the steady-state gains on (position, velocity, unknown force) of a mass under a random-walk force.
 
-    Iterates the Riccati equation of x' = v, v' = (w + n) / m, w a random walk of the given density, n white, with
-    position noise `noise_m` a sample (Kalman 1960; Anderson, Moore, Optimal Filtering, chapter 4). A white force beyond
-    the real one brings the margins of the law back that an observer takes (Doyle, Stein, IEEE TAC 24(4), 1979).
+    Iterates the Riccati equation of x' = v, v' = w / m, w a random walk of the given density, with position
+    noise `noise_m` a sample (Kalman 1960; Anderson, Moore, Optimal Filtering, chapter 4).
     """
     h = period_s
     a = np.array([[1.0, h, h * h / (2 * mass_kg)], [0.0, 1.0, h / mass_kg], [0.0, 0.0, 1.0]])
     g = np.array([h**3 / (6 * mass_kg), h**2 / (2 * mass_kg), h])
     noise = np.outer(g, g) / h * drift_n_per_sqrt_s**2
-    noise[:2, :2] += np.array([[h**3 / 3.0, h * h / 2.0], [h * h / 2.0, h]]) * (white_n_sqrt_s / mass_kg) ** 2
     r = noise_m**2
     # scaled so that all states are of order one; a fixed point is found well within these steps
     scale = np.array([noise_m, noise_m / h, noise_m * mass_kg / h**2])
@@ -138,8 +134,7 @@ def init(profile: "Profile") -> np.ndarray:
     e["macro_position_gain_ratio"], e["macro_velocity_gain_per_s"], e["macro_force_gain_n_per_m"] = gains
     if profile.micro is not None:
         e["micro_amperes_per_word"] = 1e-3 * profile.micro.rated_current_a
-        drift, white = control.micro_drift_n_per_sqrt_s, control.micro_white_n_sqrt_s
-        gains = kalman_gains(profile.micro.mass_kg, period_s, noise_m, drift, white)
+        gains = kalman_gains(profile.micro.mass_kg, period_s, noise_m, control.micro_drift_n_per_sqrt_s)
         e["micro_position_gain_ratio"], e["micro_velocity_gain_per_s"], e["micro_force_gain_n_per_m"] = gains
     return e
 

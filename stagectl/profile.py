@@ -298,7 +298,6 @@ class Control(Table):
     adaptive_gain_ceiling_ratio: Annotated[float, within(0.0, 10.0)] = 0.5
     macro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 5.0
     micro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 0.2
-    micro_white_n_sqrt_s: Annotated[float, within(0.0, 1e5)] = 0.0
 
     @model_validator(mode="after")
     def _check_law(self) -> "Control":

@@ -10,11 +10,10 @@ from tests.stage import believed, centre_m, simulated, with_values
 from tests.stage_loop import Loop
 
 
-def riccati_gains(mass_kg, period_s, noise_m, drift_n_per_sqrt_s, white_n_sqrt_s=0.0):
+def riccati_gains(mass_kg, period_s, noise_m, drift_n_per_sqrt_s):
     """Solve the same filter by scipy: exact covariance of the integrated random walk (Van Loan 1978), measured gain."""
     a = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0 / mass_kg], [0.0, 0.0, 0.0]])
     w = np.zeros((3, 3))
-    w[1, 1] = (white_n_sqrt_s / mass_kg) ** 2
     w[2, 2] = drift_n_per_sqrt_s**2
     big = scipy.linalg.expm(np.block([[-a, w], [np.zeros((3, 3)), a.T]]) * period_s)
     step = big[3:, 3:].T
@@ -32,12 +31,6 @@ def test_gains_solve_the_riccati_equation(mass_kg, noise_m, drift):
     """The code lets the force change in a line over a period, scipy at any instant of it: 0.6 % apart at most."""
     ours = estimator.kalman_gains(mass_kg, 1e-3, noise_m, drift)
     np.testing.assert_allclose(ours, riccati_gains(mass_kg, 1e-3, noise_m, drift), rtol=1e-2)
-
-
-@pytest.mark.parametrize(("drift", "white"), [(25.0, 0.25), (0.2, 1e-3), (1.0, 0.25)])
-def test_gains_solve_the_riccati_equation_with_a_white_force_too(drift, white):
-    ours = estimator.kalman_gains(40.0, 1e-3, 5e-9, drift, white)
-    np.testing.assert_allclose(ours, riccati_gains(40.0, 1e-3, 5e-9, drift, white), rtol=1e-2)
 
 
 def test_gains_are_of_a_stable_filter_and_follow_the_noise():

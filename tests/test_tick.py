@@ -31,19 +31,18 @@ def test_words_are_the_nearest_integers_of_what_was_asked(oled_profile, oled_mac
     """
     loop = Loop(simulated(oled_profile, oled_machine, law))
     signs = set()
-    owed_n = {"macro": 0.0, "micro": 0.0}
+    owed = {"macro": 0.0, "micro": 0.0}
     for setpoint in trajectory.trapezoid(0.05, 0.2, dwell_s=0.1, lead_s=0.1).setpoints:
         loop.cycle(setpoint)
         c = loop.simulation.controller.command[0]
         for axis, step_n in (("macro", 0.5), ("micro", 0.06)):
             word, asked_n = int(c[f"{axis}_word"]), float(c[f"{axis}_force_asked_n"])
             assert c[f"{axis}_force_n"] == pytest.approx(word * step_n, rel=1e-12)
-            owed_n[axis] += asked_n - word * step_n
-            # what is asked counts in sixteenths of a step: a few of the rounding to them, each 1/32 at most, add up
-            assert abs(owed_n[axis]) <= (0.5 + 50 / 32) * step_n
+            owed[axis] += math.floor(16.0 * asked_n / step_n + 0.5) / 16.0 - word  # it counts in sixteenths
+            assert abs(owed[axis]) <= 0.5
             signs.add((axis, np.sign(word)))
-        owed = {axis: loop.simulation.controller.estimator[f"{axis}_carried_word"][0] for axis in owed_n}
-        assert max(map(abs, owed.values())) <= 0.5
+        carried = {axis: loop.simulation.controller.estimator[f"{axis}_carried_word"][0] for axis in owed}
+        assert carried == owed
         assert loop.simulation.controller.estimator["micro_word"][0] == c["micro_word"]
         assert loop.simulation.controller.estimator["macro_word"][0] == c["macro_word"]
     assert {("macro", 1.0), ("macro", -1.0), ("micro", 1.0), ("micro", -1.0)} <= signs
