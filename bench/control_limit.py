@@ -293,7 +293,9 @@ def _robustness(profile: Profile, seeds: Sequence[int]) -> Iterator[Figure]:
     apart = 100.0 * float(np.max(np.max(peaks, axis=1) / np.min(peaks, axis=1)) - 1.0)
     yield judged(STIFFNESS, apart, used, "the same seed, stiffness known no better than x1")
     started = [
-        run(profile, machine(profile, *ratios, 10.0), surge(), seed) for ratios in _RATIOS["wrong"] for seed in seeds
+        run(profile, machine(profile, ratio, damping_ratio, 10.0), surge(), seed)
+        for ratio, damping_ratio in _RATIOS["wrong"]
+        for seed in seeds
     ]
     late = np.concatenate([np.concatenate([one.error_m[300:950], one.error_m[1300:]]) for one in started])
     strayed = 1e6 * max(peak(one.error_m) for one in started)
