@@ -80,10 +80,9 @@ def _rules(law: str) -> list[str]:
     if law == "pid":
         return ["PID has one number, its bandwidth; gains follow from it as `stagectl/laws/pid.py` says."]
     return [
-        "The sliding surface is critically damped and a little slower than the sliding gain: eta = 0.75 k / m, "
-        "gamma = eta² / 4.",
-        "The observer reckons with more force than there is, so that it takes no margin from the law (Doyle and "
-        "Stein, 1979).",
-        "The sliding gain is the number that was searched; its margins hold up to the adaptive gain's ceiling "
-        "(adapted).",
+        "One end of the loop is fast, the other sets the margin: the law is as fast as the cycle allows, k / m at 0.18 "
+        "and eta at 0.163 of its rate.",
+        "With w the bandwidth, the integral is at w / 8 and the observer's poles at 2 w / 3, by the density of the "
+        "force that it reckons with.",
+        "The bandwidth is the number that was searched; its margins hold up to the adaptive gain's ceiling (adapted).",
     ]
