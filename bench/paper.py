@@ -1,7 +1,7 @@
 """The paper's method as printed and corrected, and what the project's identification makes of the paper's tests.
 
-Rows of the chapters are reported beside the paper's number; bars are those of the identification, of its cost, and of
-the time that `stagectl reproduce` takes from nothing.
+Rows of the chapters are reported beside the paper's number; bars are those of the identification, of its cost, of
+control at the limit (`bench.control_limit`), and of the time that `stagectl reproduce` takes from nothing.
 """
 
 import os
@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from bench import ablation, learning, limits
+from bench import ablation, control_limit, learning, limits
 from bench.figure import Bar, Figure, judged
 from stagectl.paper import gated, identification_test, recursive_least_squares, rig_chapter
 from stagectl.paper.chapters import CHAPTERS, work_through
@@ -26,7 +26,8 @@ from stagectl.paper.recursive_least_squares import errors_percent
 from stagectl.paper.rows import Chapter
 
 ABOUT = (
-    "As printed and corrected: `docs/paper.md` says where each equation stands. Bars are written in `bench/paper.py`."
+    "As printed and corrected: `docs/paper.md` says where each equation stands. "
+    "Bars are written in `bench/paper.py` and `bench/control_limit.py`."
 )
 
 TABLE_2_ERROR = Bar("identification, Table 2 test, 100 nm, exact masses: worst of four", "%", 0.001)
@@ -61,7 +62,7 @@ def figures(*, full: bool, say: Say) -> Iterator[Figure]:
     yield from _table_2(samples)
     yield from _rig()
     yield from _costs(samples)
-    for part in (limits, ablation, learning):
+    for part in (control_limit, limits, ablation, learning):
         yield from part.figures(full=full, say=say)
     for chapter in work_through(tuple(CHAPTERS), lambda what, _: say(what)):
         yield from figures_of(chapter)

@@ -30,7 +30,7 @@ def call(capsys, *arguments) -> tuple[int, str, str]:
 def slack(tmp_path, oled_profile):
     """A copy of the shipped profile whose law is slow; returns the file."""
     text = oled_profile.source_path.read_text()
-    changed = text.replace("micro_bandwidth_hz = 48.0", "micro_bandwidth_hz = 8.0  # by hand")
+    changed = text.replace("micro_bandwidth_hz = 48.0", "micro_bandwidth_hz = 15.0  # by hand")
     assert changed != text
     path = tmp_path / "slack.toml"
     path.write_text(changed)
@@ -58,7 +58,7 @@ def test_the_command_writes_a_profile_whose_loops_keep_the_margins(capsys, tmp_p
     lines = new.read_text().splitlines()
     (line,) = [line for line in lines if line.startswith("micro_bandwidth_hz")]
     assert "# by hand; tune " in line
-    assert line.endswith("; was 8")
+    assert line.endswith("; was 15")
     touched = {change["key"].removeprefix("control.") for change in answer["changes"]}
     assert {one for one in old.splitlines() if one.partition(" ")[0] not in touched} <= set(lines)
 
@@ -99,9 +99,7 @@ def test_pid_has_its_own_number(oled_profile):
 def test_what_is_unstable_whatever_the_gain_is_refused_with_a_remedy(oled_profile):
     """A spring that pushes away: 250 Hz of it are faster than any loop with this delay."""
     wild = with_values(oled_profile, micro__spring_n_per_m=-1e8)
-    with pytest.raises(
-        RequestError, match=r"unstable under dsmc with every control\.micro_drift_n_per_sqrt_s .* check "
-    ):
+    with pytest.raises(RequestError, match=r"unstable under dsmc with every control\.micro_bandwidth_hz .* check "):
         tuned(wild, "dsmc", Asked())
 
 
@@ -111,11 +109,13 @@ def test_gains_that_are_unstable_as_they_are_are_said_so_and_mended(oled_profile
     assert math.isinf(found.before.worst_sensitivity)
     assert math.isnan(found.before.hold_m)
     assert found.after.worst_sensitivity <= 2.01
-    assert verdict(found).startswith("The gains as they were are unstable. Greatest sensitivity ")
+    assert found.after.worst_sensitivity > 1.85
+    said = f"The gains as they were are unstable. Greatest sensitivity {found.after.worst_sensitivity:.2f}, delay"
+    assert verdict(found).startswith(said)
 
 
 def test_a_bandwidth_that_no_gain_has_is_refused(oled_profile):
-    with pytest.raises(RequestError, match=r"no control\.micro_drift_n_per_sqrt_s keeps a bandwidth of 0\.2 Hz"):
+    with pytest.raises(RequestError, match=r"no control\.micro_bandwidth_hz keeps a bandwidth of 0\.2 Hz"):
         tuned(oled_profile, "dsmc", Asked(bandwidth_hz=0.2))
 
 

@@ -80,8 +80,9 @@ def _rules(law: str) -> list[str]:
     if law == "pid":
         return ["PID has one number, its bandwidth; gains follow from it as `stagectl/laws/pid.py` says."]
     return [
-        "The law is two octaves faster than the loop is to be: k / m = 3.75 w, eta = 3.4 w; its integral is slow: "
-        "2 gamma / eta = w / 8. It acts on a prediction, so that it adds little noise of its own.",
-        "The observer decides: the drift density of its unknown force sets margin and stiffness, and is the number "
-        "that was searched; its margins hold up to the adaptive gain's ceiling (adapted).",
+        "One end of the loop is fast, the other sets the margin: the law is as fast as the cycle allows, k / m at 0.18 "
+        "and eta at 0.163 of its rate.",
+        "With w the bandwidth, the integral is at w / 8 and the observer's poles at 2 w / 3, by the density of the "
+        "force that it reckons with.",
+        "The bandwidth is the number that was searched; its margins hold up to the adaptive gain's ceiling (adapted).",
     ]

@@ -1,10 +1,11 @@
 """Gains with a stated bandwidth and margin, from the linearised loop of the identified machine.
 
-DSMC. The law is two octaves faster than the loop is to be: w is 4.8 % of the cycle rate, about the crossover of a loop
-with a cycle of delay and Ms = 2, k / m = 3.75 w, eta = 3.4 w, with a slow integral, 2 gamma / eta = w / 8. It acts on a
-prediction, so that the observer behind the prediction decides: the drift density of its unknown force is the one number
-left, and sets margin and stiffness together. It is made as large as the margins allow, the adaptive gain at its ceiling
-included, or as the bandwidth that is asked for takes. PID has its bandwidth as that one number.
+DSMC. One end of the loop is fast, the other sets the margin. The law is as fast as the cycle allows: k / m = 0.18 and
+eta = 0.163 of the cycle's rate, in 2 pi. With w the bandwidth its integral is at 2 gamma / eta = w / 8, and the poles
+of the observer at 2 w / 3, by the density of the force that it reckons with (Kwakernaak, Sivan, Linear Optimal Control
+Systems, section 5.3: the law's end recovers the observer's margins). The adaptive gain may rise by 5 %. What is left is
+one number, w: it is made as large as the margins allow, the adaptive gain at its ceiling included, or as the bandwidth
+that is asked for takes. PID has its bandwidth as that one number.
 
 Every result is checked in the gap and in contact on either side, and with the moved mass 10 % off.
 """
@@ -31,8 +32,13 @@ CEILING = "gap, adapted"
 """With the adaptive gain at its ceiling."""
 MASS_RATIO = 0.1
 
-_RATE_RATIO = 0.048  # of the cycle rate: w
-_RATIOS = {"eta_ratio": 3.4, "gamma_ratio": 0.22, "sliding_ratio": 3.75}  # in w
+_SLIDING_RATIO, _ETA_RATIO = (
+    0.18,
+    0.163,
+)  # of the cycle's rate: from 0.2 on the loop gain rises again towards half of it
+_INTEGRAL_RATIO = 0.129  # of the bandwidth
+_CEILING_RATIO = 0.05
+_OBSERVER_RATIO = 0.67  # of the bandwidth: where the poles of a Kalman filter of a random-walk force are
 _SPAN = (1e-2, 1e2)  # of the profile's own number, searched
 _GRID_COUNT = 13
 _BISECTIONS = 7
@@ -103,22 +109,21 @@ def tuned(
     """
     say("judging the gains as they are", 0.0)
     before = assessed(profile, law)
-    fixed, key = _rule(profile, law)
-    at = profile.model_copy(update={"control": profile.control.model_copy(update=fixed)})
+    key = _key(profile, law)
     say("searching", 0.2)
-    value = _searched(at, law, key, asked)
+    value = _searched(profile, law, key, asked)
     say("checking it everywhere", 0.7)
-    found = assessed(_with(at, key, value), law)
+    found = assessed(_with(profile, law, value), law)
     while asked.bandwidth_hz is None and not _keeps(found, asked):  # a place that is worse than the gap
         value *= 0.9
         if value < _SPAN[0] * getattr(profile.control, key):
             break
-        found = assessed(_with(at, key, value), law)
+        found = assessed(_with(profile, law, value), law)
     _refuse(profile, law, asked, found)
     rounded = float(f"{value:.4g}")
-    values = fixed | {key: rounded}
+    values = _gains(profile, law, rounded)
     old = {name: float(getattr(profile.control, name)) for name in values}
-    return Tuned(law, values, old, before, assessed(_with(at, key, rounded), law))
+    return Tuned(law, values, old, before, assessed(_with(profile, law, rounded), law))
 
 
 def assessed(profile: "Profile", law: str) -> Assessment:
@@ -165,17 +170,35 @@ def _heavier(body: Body, profile: "Profile", ratio: float) -> Body:
     return replace(body, parameters=parameters)
 
 
-def _rule(profile: "Profile", law: str) -> tuple[dict[str, float], str]:
-    """Return the gains that the rules fix, and the key of the one that is searched."""
-    axis = profile.axes[-1]
+def _key(profile: "Profile", law: str) -> str:
+    """Return the key of the number that is searched."""
+    if law == "pid" and profile.micro is not None:
+        return "pid_bandwidth_hz"
+    return f"{profile.axes[-1]}_bandwidth_hz"
+
+
+def _gains(profile: "Profile", law: str, bandwidth_hz: float) -> dict[str, float]:
+    """Return the gains that the rules make of a bandwidth, by their keys of [control]."""
+    key = _key(profile, law)
     if law == "pid":
-        return {}, "pid_bandwidth_hz" if profile.micro is not None else "macro_bandwidth_hz"
-    w_hz = _RATE_RATIO * profile.cycle.rate_hz
-    return {f"{axis}_bandwidth_hz": float(f"{w_hz:.4g}"), **_RATIOS}, f"{axis}_drift_n_per_sqrt_s"
+        return {key: bandwidth_hz}
+    axis = profile.axes[-1]
+    observer_per_s = _OBSERVER_RATIO * 2.0 * math.pi * bandwidth_hz
+    noise = profile.axis(axis).mass_kg * profile.interferometer.noise_m * math.sqrt(profile.cycle.period_s)
+    cycles = profile.cycle.rate_hz / bandwidth_hz
+    gains = {
+        "eta_ratio": _ETA_RATIO * cycles,
+        "gamma_ratio": 0.5 * _INTEGRAL_RATIO * _ETA_RATIO * cycles,
+        "sliding_ratio": _SLIDING_RATIO * cycles,
+        f"{axis}_drift_n_per_sqrt_s": observer_per_s**3 * noise,
+    }
+    rounded = {name: float(f"{value:.3g}") for name, value in gains.items()}
+    return {key: bandwidth_hz, **rounded, "adaptive_gain_ceiling_ratio": _CEILING_RATIO}
 
 
-def _with(profile: "Profile", key: str, value: float) -> "Profile":
-    return profile.model_copy(update={"control": profile.control.model_copy(update={key: value})})
+def _with(profile: "Profile", law: str, bandwidth_hz: float) -> "Profile":
+    gains = _gains(profile, law, bandwidth_hz)
+    return profile.model_copy(update={"control": profile.control.model_copy(update=gains)})
 
 
 def _searched(profile: "Profile", law: str, key: str, asked: Asked) -> float:
@@ -183,10 +206,10 @@ def _searched(profile: "Profile", law: str, key: str, asked: Asked) -> float:
     now = getattr(profile.control, key)
     body = believed_body(profile)
 
-    most = most_adaptive_gain_ratio(profile, law) if asked.bandwidth_hz is None else 0.0
+    most = most_adaptive_gain_ratio(_with(profile, law, now), law) if asked.bandwidth_hz is None else 0.0
 
     def found(value: float) -> Margins:
-        return margins(linearise(_with(profile, key, value), law, body, GAP, most))
+        return margins(linearise(_with(profile, law, value), law, body, GAP, most))
 
     def keeps(value: float) -> bool:
         one = found(value)
