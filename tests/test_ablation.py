@@ -30,7 +30,7 @@ def test_an_observer_fed_with_what_was_asked_holds_worse(whole, oled_profile, ol
     assert found.hold_m > 1.15 * whole.hold_m
 
 
-@pytest.mark.parametrize(("name", "times"), [("no unknown force", 2.0), ("no sliding part", 3.0), ("no integral", 1.3)])
+@pytest.mark.parametrize(("name", "times"), [("no unknown force", 2.0), ("no sliding part", 2.0), ("no integral", 1.2)])
 def test_parts_of_the_law_earn_their_place_in_motion(whole, oled_profile, oled_machine, name, times):
     assert measured(part(name), oled_profile, oled_machine, SEED).peak_m > times * whole.peak_m
 
@@ -46,7 +46,9 @@ def test_every_part_changes_a_state_of_its_own(oled_profile):
             (name, field)
             for name, value in controller.snapshot().items()
             for field in (value.dtype.names or ("",))
-            if not np.array_equal(value[field] if field else value, fresh[name][field] if field else fresh[name])
+            if not np.array_equal(
+                value[field] if field else value, fresh[name][field] if field else fresh[name], equal_nan=True
+            )
         )
         assert one.asked_fed or changed
         assert (changed, one.asked_fed) not in seen

@@ -121,6 +121,8 @@ def test_the_bound_is_below_every_law_and_its_advice_saves_what_it_says(held, ol
     bounds = held.bounds
     assert bounds.hold.true_rms_m <= bounds.robust.true_rms_m <= bounds.stiff.true_rms_m
     assert bounds.hold.true_rms_m < held.hold_m
+    assert bounds.robust.true_rms_m < bounds.as_stiff.true_rms_m < bounds.stiff.true_rms_m
+    assert held.hold_m == pytest.approx(bounds.as_stiff.true_rms_m, rel=0.1)  # nothing is given away
     assert bounds.around.delay_s == pytest.approx(575e-6 + 150e-6)
     savings = [lever.saved_m for lever in held.levers]
     assert savings == sorted(savings, reverse=True)

@@ -65,6 +65,16 @@ def test_a_limit_of_sensitivity_costs_hold_and_no_weights_of_a_grid_do_better():
     assert lqg.optimum(DRIFTING, 2.0).true_rms_m == lqg.bound(DRIFTING).true_rms_m
 
 
+def test_a_loop_that_has_to_be_as_stiff_holds_worse_the_stiffer_it_is():
+    loops = [lqg.optimum(REALISTIC, 2.0, peak_m) for peak_m in (math.inf, 1e-6, 0.5e-6)]
+    holds = [one.true_rms_m for one in loops]
+    assert holds == sorted(holds)
+    for one, peak_m in zip(loops[1:], (1e-6, 0.5e-6), strict=True):
+        assert Loop(REALISTIC, one.design).step_peak_m(1.0) == pytest.approx(peak_m, rel=0.01)
+    with pytest.raises(RequestError, match=r"by 100 nm at most; with a greatest sensitivity of 2 .* nm at least"):
+        lqg.optimum(REALISTIC, 2.0, 100e-9)
+
+
 def test_no_weights_keep_to_a_sensitivity_that_no_loop_has():
     with pytest.raises(RequestError, match=r"greatest sensitivity to 1.01 .* shorten the delay"):
         lqg.stiffest(REALISTIC, 1.01)

@@ -70,6 +70,7 @@ class Bounds:
     robust: Hold  # the best with MAX_SENSITIVITY
     stiff: Hold  # of the loop that a force moves least with MAX_SENSITIVITY
     stiff_step_peak_m: float
+    as_stiff: Hold | None  # the best with MAX_SENSITIVITY that a force moves no more than the law; None = there is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +177,6 @@ def _with_bounds(
     fitted: bool = False,
 ) -> Budget:
     say("computing the bound", 0.8)
-    bounds = bounds_of(profile, noises)
-    say("looking for what would help", 0.9)
     hold_m = shares.total_rms_m(profile, law, noises, body)
     of_body = body if body is not None else shares.believed_body(profile)
     loop = linearise(profile, law, of_body)
@@ -185,13 +184,18 @@ def _with_bounds(
     force_n = np.full(round(0.5 / profile.cycle.period_s), STEP_N)
     force_n[0] = 0.0
     answer_m = shares.answer(system, {f"{loop.precise_axis}_force_n": force_n}, "end_position_m")
-    levers = _levers(profile, law, noises, body, hold_m)
     peak_m = float(np.max(np.abs(answer_m)))
+    bounds = bounds_of(profile, noises, peak_m)
+    say("looking for what would help", 0.9)
+    levers = _levers(profile, law, noises, body, hold_m)
     return Budget(law, noises, parts, bounds, margins(loop), hold_m, peak_m, levers, fitted)
 
 
-def bounds_of(profile: "Profile", noises: Noises) -> Bounds:
-    """Compute the bounds of a profile's sensor, delay and torque step; RequestError where it states no noise."""
+def bounds_of(profile: "Profile", noises: Noises, step_peak_m: float) -> Bounds:
+    """Compute the bounds of a profile's sensor, delay and torque step; RequestError where it states no noise.
+
+    `step_peak_m`: how far STEP_N moves the end under the law that they are held against.
+    """
     precise = profile.axes[-1]
     axis = profile.axis(precise)
     lag_s = axis.current_loop_s + compose.command_lag_s(profile.effects, f"{precise}_command")
@@ -204,9 +208,12 @@ def bounds_of(profile: "Profile", noises: Noises) -> Bounds:
         torque_step_n=axis.torque_step_n,
     )
     stiff = lqg.stiffest(around, MAX_SENSITIVITY)
-    return Bounds(
-        around, lqg.bound(around), lqg.optimum(around, MAX_SENSITIVITY), stiff.hold(), stiff.step_peak_m(STEP_N)
-    )
+    try:
+        as_stiff = lqg.optimum(around, MAX_SENSITIVITY, step_peak_m / STEP_N)
+    except RequestError:
+        as_stiff = None
+    robust = lqg.optimum(around, MAX_SENSITIVITY)
+    return Bounds(around, lqg.bound(around), robust, stiff.hold(), stiff.step_peak_m(STEP_N), as_stiff)
 
 
 def _levers(profile: "Profile", law: str, noises: Noises, body: Body | None, hold_m: float) -> tuple[Lever, ...]:

@@ -68,8 +68,10 @@ def bounds_figure(budget: Budget, image_format: str = "svg") -> bytes:
     with matplotlib.rc_context(STYLE):
         drawing, (axes,) = panels_of(2.9, 1, 1)
         bounds = budget.bounds
+        as_stiff = [] if bounds.as_stiff is None else [("as stiff", bounds.as_stiff.true_rms_m, SERIES[2])]
         marks = (
             (f"{budget.law} as it is (Ms {budget.margins.sensitivity_peak_ratio:.2f})", budget.hold_m, SERIES[0]),
+            *((f"{name}, Ms <= {MAX_SENSITIVITY:g}", value_m, colour) for name, value_m, colour in as_stiff),
             (f"stiffest loop at Ms {MAX_SENSITIVITY:g}", bounds.stiff.true_rms_m, SERIES[3]),
             (f"best hold at Ms <= {MAX_SENSITIVITY:g}", bounds.robust.true_rms_m, SERIES[2]),
             (f"least hold at all (Ms {bounds.hold.robustness.max_sensitivity:.2f})", bounds.hold.true_rms_m, SERIES[1]),

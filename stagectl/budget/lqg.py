@@ -305,15 +305,34 @@ def bound(around: Surroundings) -> Hold:
     return Loop(around, Design(around.force_noise_n, around.force_drift_n_per_sqrt_s)).hold()
 
 
-def optimum(around: Surroundings, max_sensitivity: float = 2.0) -> Hold:
+def optimum(around: Surroundings, max_sensitivity: float = 2.0, step_peak_m_per_n: float = math.inf) -> Hold:
     """Return the best hold whose greatest sensitivity keeps to a limit: the bound where that does, else searched.
 
+    With `step_peak_m_per_n` the loop must be as stiff besides: a step of force moves it no further than that, m a N.
     RequestError where no weights keep to it.
     """
-    best = bound(around)
-    if best.robustness.max_sensitivity <= max_sensitivity:
+    loop = Loop(around, Design(around.force_noise_n, around.force_drift_n_per_sqrt_s))
+    best = loop.hold()
+    if best.robustness.max_sensitivity <= max_sensitivity and loop.step_peak_m(1.0) <= step_peak_m_per_n:
         return best
-    return _searched(around, max_sensitivity, lambda loop: loop.hold().true_rms_m).hold()
+
+    def size(one: Loop) -> float:
+        beyond = max(one.step_peak_m(1.0) / step_peak_m_per_n - 1.0, 0.0)
+        return one.hold().true_rms_m * math.exp(_SENSITIVITY_PRICE * beyond)
+
+    try:
+        found = _searched(around, max_sensitivity, size)
+    except RequestError:
+        if math.isinf(step_peak_m_per_n):
+            raise
+        found = stiffest(around, max_sensitivity)
+    if not found.step_peak_m(1.0) <= step_peak_m_per_n * _LIMIT_SLACK:
+        least_m = stiffest(around, max_sensitivity).step_peak_m(1.0)
+        raise RequestError(
+            f"a step of 1 N is to move the end by {step_peak_m_per_n * 1e9:.3g} nm at most; with a greatest "
+            f"sensitivity of {max_sensitivity:g} it moves it by {least_m * 1e9:.3g} nm at least: allow more of either"
+        )
+    return found.hold()
 
 
 def stiffest(around: Surroundings, max_sensitivity: float = 2.0) -> Loop:
@@ -330,8 +349,7 @@ def _searched(around: Surroundings, max_sensitivity: float, size: Callable[[Loop
 
     def made(place: np.ndarray) -> Loop:
         drift_n, effort_n = (float(value) * typical_n for value in np.exp(np.clip(place, -30.0, 10.0)))
-        drift = drift_n / math.sqrt(around.period_s)
-        return Loop(around, Design(around.force_noise_n, drift, effort_n))
+        return Loop(around, Design(around.force_noise_n, drift_n / math.sqrt(around.period_s), effort_n))
 
     def cost(place: np.ndarray) -> float:
         try:

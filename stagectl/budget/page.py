@@ -50,7 +50,11 @@ def verdict(budget: Budget) -> str:
         believed += " The force noise was fitted to this run, so that the sum says little."
     bound = budget.bounds.hold.true_rms_m
     over = budget.hold_m / bound
-    return f"{believed} Least hold possible here: {bound * 1e9:.2f} nm; {budget.law} is {over:.2f} x that."
+    said = f"{believed} Least hold possible here: {bound * 1e9:.2f} nm; {budget.law} is {over:.2f} x that"
+    as_stiff = budget.bounds.as_stiff
+    if as_stiff is None:
+        return f"{said}, and stiffer than any linear loop with a sensitivity of {MAX_SENSITIVITY:g}."
+    return f"{said}, and {budget.hold_m / as_stiff.true_rms_m:.2f} x the best that is as stiff."
 
 
 def shares_table(part: Part) -> Table:
@@ -84,8 +88,10 @@ def bounds_table(budget: Budget) -> Table:
             for name, hold, peak in (
                 ("least hold", bounds.hold, None),
                 (f"best, Ms <= {MAX_SENSITIVITY:g}", bounds.robust, None),
+                (f"as stiff, Ms <= {MAX_SENSITIVITY:g}", bounds.as_stiff, budget.step_peak_m),
                 (f"stiffest, Ms <= {MAX_SENSITIVITY:g}", bounds.stiff, bounds.stiff_step_peak_m),
             )
+            if hold is not None
         ),
     ]
     return Table(
@@ -105,8 +111,9 @@ def bounds_table(budget: Budget) -> Table:
         f"Hold in root mean square; the last column is the peak after a step of force. LQG for "
         f"{bounds.around.delay_s * 1e3:.3g} ms from sample to force, {bounds.around.sensor_noise_m * 1e9:.3g} nm of "
         f"sensor noise, {bounds.around.force_noise_n * 1e3:.3g} mN of force noise, steps of "
-        f"{bounds.around.torque_step_n:.3g} N. The stiffest loop is the other end: what it gains against forces it "
-        "pays in hold.",
+        f"{bounds.around.torque_step_n:.3g} N. The least hold is that of a loop that forces move far; what a loop "
+        "gains against forces it pays in hold. As stiff: the best found over all weights that a force moves no more "
+        "than it moves the law.",
     )
 
 
