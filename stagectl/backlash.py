@@ -6,24 +6,28 @@ From the micro's equation alone, with x_b = d1 - d (Kang et al. 2023, (2) and (5
     F_b = K_r x_b - K_r b_r + c x_b'   right,   K_l x_b + K_l b_l + c x_b'   left,   0 in the gap
 
 Every term, *regressors included*, passes the same w0^3 / (s + w0)^3, so the filter adds no bias (the printed
-recursion filters one side only, and loses 5-12 %). A sample counts for a side when the joint has been pressed
-there for as long as the filter remembers: by force first, by geometry once that edge is known. One three-parameter
-recursive least-squares estimate a side. The force of the motor is the decoded integer that was sent, averaged over
-the sample interval through the current loop, never the float that was asked. Pure; knows no bus and no clock.
+recursion filters one side only, and loses 5-12 %). While an edge is unknown, a sample counts for its side when the
+joint has been pressed there for as long as the filter remembers. Once both are known every sample counts: the
+regressors themselves are switched at the edges, before the filter. In the gap the contact is nil, and what the belief
+has wrong (mass, springs, a cable, an offset) shows there alone; it is found along with the joint, as far as it is
+doubted. The force of the motor is the decoded integer that was sent, averaged over the sample interval through the
+current loop, never the float that was asked. Pure; knows no bus and no clock.
 """
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stagectl import regression
 from stagectl.compiled import compiled
 from stagectl.signals import Record
 
 if TYPE_CHECKING:
     from stagectl.profile import Profile
 
-_CHAINS = ("end", "joint", "force")
 _SIDES = ("left", "right")
+_LEFT, _RIGHT = regression.COMMON_COUNT, regression.COMMON_COUNT + regression.SIDE_COUNT
 
 BACKLASH = np.dtype(
     [
@@ -32,10 +36,11 @@ BACKLASH = np.dtype(
         ("hold_cycles", "f8"),
         ("forgetting_ratio", "f8"),
         ("least_force_n", "f8"),
-        ("doubted_mass_kg", "f8"),  # a wrong mass or force constant shows as so much inertia, never as contact
         ("settle_cycles", "f8"),
         ("force_share_ratio", "f8"),
         ("margin_m", "f8"),
+        ("end_spring_n_per_m", "f8"),  # to the base, of the end: F_2 of (10); the stage has none
+        ("end_damping_n_s_per_m", "f8"),
         # exact response of one chain of three equal lags to a first-order-hold input: powers of w0 h
         ("decay_0", "f8"),
         ("decay_1", "f8"),
@@ -57,17 +62,17 @@ BACKLASH = np.dtype(
         ("force_1", "f8"),
         ("force_2", "f8"),
         ("force_3", "f8"),
-        ("one_1", "f8"),
-        ("one_2", "f8"),
-        ("one_3", "f8"),
-        ("current_macro_a", "f8"),
+        ("switched", "f8", (2, regression.SIDE_COUNT, 3)),  # regressors that are nil off their side's contact
+        ("warm", "f8"),  # cycles that both edges have been known for
         ("started", "f8"),
         ("cycle", "f8"),
         ("origin_m", "f8"),
+        ("end_origin_m", "f8"),
         ("greatest_force_n", "f8"),
         ("contact_force_n", "f8"),  # Y, the filtered contact force
         ("side", "f8"),
         ("held", "f8"),
+        ("held_from_m", "f8"),  # x_b where the force of this hold was first seen
         ("unsettled", "f8"),  # cycles until the filters have forgotten how they were started
         ("motor_force_n", "f8"),  # at the last sample, through the current loop
         ("left_stiffness_n_per_m", "f8"),
@@ -76,28 +81,72 @@ BACKLASH = np.dtype(
         ("left_stiffness_sd_n_per_m", "f8"),
         ("left_sd_m", "f8"),
         ("left_samples", "f8"),
+        ("left_origin_m", "f8"),  # joint where the side was first pressed: the intercept is the force there
+        ("left_line_m", "f8"),  # where the straight part of the contact meets zero
+        ("left_knee_m", "f8"),
         ("right_stiffness_n_per_m", "f8"),
         ("right_m", "f8"),
         ("right_damping_n_s_per_m", "f8"),
         ("right_stiffness_sd_n_per_m", "f8"),
         ("right_sd_m", "f8"),
         ("right_samples", "f8"),
-        ("left_residual_n2", "f8"),
-        ("right_residual_n2", "f8"),
-        ("theta", "f8", (2, 3)),
-        ("covariance", "f8", (2, 3, 3)),
+        ("right_origin_m", "f8"),
+        ("right_line_m", "f8"),
+        ("right_knee_m", "f8"),
+        ("mass_kg", "f8"),  # found beyond the believed one, for a force constant that is taken to be right
+        ("mass_sd_kg", "f8"),
+        ("residual_ratio", "f8"),  # mean square innovation over what noise explains
+        ("residual_samples", "f8"),
+        *regression.dtype_fields(),
     ]
 )
 
 _POSITION_SCALE_M = 1e-4
 _VELOCITY_SCALE_M_PER_S = 1e-3
-_PRIOR_N2 = 1e4
-_DOUBT_SDS = 5.0  # of the mass, below which a force may be inertia
-_SURE_SDS = 5.0  # that a stiffness is above zero by before an edge is published
-_CORRELATION_SAMPLES = 20.0  # samples that share one independent residual, from the filter's memory of 3 tau
+_KNEE_SCALE_N_M = 1e-6
+_KNEE_WIDTH_M = 10e-6  # of the pulse that stands for a knee
+_TURN_M_PER_S = 1e-4  # over which a hysteresis turns round
+_SIDE_VARIANCES = (np.inf, np.inf, np.inf)  # stiffness, intercept, damping: nothing known
+_SURE_SDS = 5.0  # that a force is beyond what the doubts explain by, and a stiffness above zero
 
 
-def init(profile: "Profile", filter_s: float = 0.01, forgetting_ratio: float = 1.0) -> np.ndarray:
+@dataclass(frozen=True, slots=True)
+class Doubts:
+    """Standard deviations of what is believed; 0 = exact, not looked for."""
+
+    mass_kg: float = 0.0
+    spring_n_per_m: float = 0.0
+    damping_n_s_per_m: float = 0.0
+    end_spring_n_per_m: float = 0.0
+    end_damping_n_s_per_m: float = 0.0
+    force_n: float = 0.0
+    knee_n_m: float = 0.0
+    """Of K delta^2 / 24, by which a contact with a knee of length delta is softer than a line that starts in its middle."""
+    hysteresis_n_per_m: float = 0.0
+    """Of stiffness that a side has more when pressed than when let go, halved."""
+
+    @property
+    def variances(self) -> np.ndarray:
+        """Those of theta, shape (regression.COUNT,)."""
+        common = (
+            *(self.mass_kg, self.spring_n_per_m, self.damping_n_s_per_m),
+            *(self.end_spring_n_per_m, self.end_damping_n_s_per_m, self.force_n),
+        )
+        side = (
+            *_SIDE_VARIANCES,
+            (self.knee_n_m / _KNEE_SCALE_N_M) ** 2,
+            (self.hysteresis_n_per_m * _POSITION_SCALE_M) ** 2,
+        )
+        return np.array([*(one * one for one in common), *side, *side])
+
+
+def init(
+    profile: "Profile",
+    filter_s: float = 0.01,
+    forgetting_ratio: float = 1.0,
+    doubts: Doubts | None = None,
+    force_noise_n: float = 5e-3,
+) -> np.ndarray:
     """Make BACKLASH: nothing known of edges and stiffness, whatever the profile believes."""
     b = np.zeros(1, BACKLASH)
     h = 1.0 / profile.cycle.rate_hz
@@ -108,9 +157,10 @@ def init(profile: "Profile", filter_s: float = 0.01, forgetting_ratio: float = 1
     b["forgetting_ratio"] = forgetting_ratio
     b["settle_cycles"] = np.ceil(16.0 * filter_s / h)
     b["least_force_n"] = 0.3
-    b["doubted_mass_kg"] = _DOUBT_SDS * profile.micro.mass_sd_kg if profile.micro is not None else 0.0
-    b["force_share_ratio"] = 0.4
+    b["force_share_ratio"] = 0.1
     b["margin_m"] = 10e-6
+    b["position_noise_m"] = profile.interferometer.noise_m
+    b["force_noise_n"] = force_noise_n
     # Chain of three: X = expm(A h), input integrals by a Taylor series of the augmented matrix (first-order hold)
     augmented = np.zeros((5, 5))
     augmented[0, 0] = augmented[1, 1] = augmented[2, 2] = -w
@@ -125,12 +175,16 @@ def init(profile: "Profile", filter_s: float = 0.01, forgetting_ratio: float = 1
     for k in range(3):
         b[f"new_{k + 1}"] = total[k, 4]
         b[f"old_{k + 1}"] = total[k, 3] - total[k, 4]
-    b["covariance"][0, :] = np.eye(3) * _PRIOR_N2
+    if doubts is None:
+        doubts = Doubts(mass_kg=profile.micro.mass_sd_kg) if profile.micro is not None else Doubts()
+    regression.prepare(b, doubts.variances)
     for side in _SIDES:
         b[f"{side}_sd_m"] = np.inf
         b[f"{side}_stiffness_sd_n_per_m"] = np.inf
         b[f"{side}_m"] = np.nan
+        b[f"{side}_line_m"] = np.nan
         b[f"{side}_stiffness_n_per_m"] = np.nan
+    b["mass_sd_kg"] = doubts.mass_kg
     return b
 
 
@@ -144,47 +198,141 @@ def _filtered(b: Record, z1: float, z2: float, z3: float, old: float, new: float
 
 
 @compiled
-def _update(b: Record, side: int, regressor_0: float, regressor_1: float, regressor_2: float, y: float) -> float:
-    """One recursive least-squares step of a side (0 left, 1 right); (20) with h(k) (E9)."""
-    theta = b.theta
-    p = b.covariance
-    h = (regressor_0, regressor_1, regressor_2)
-    ph0 = p[side, 0, 0] * h[0] + p[side, 0, 1] * h[1] + p[side, 0, 2] * h[2]
-    ph1 = p[side, 1, 0] * h[0] + p[side, 1, 1] * h[1] + p[side, 1, 2] * h[2]
-    ph2 = p[side, 2, 0] * h[0] + p[side, 2, 1] * h[1] + p[side, 2, 2] * h[2]
-    ph = (ph0, ph1, ph2)
-    scale = b.forgetting_ratio + h[0] * ph0 + h[1] * ph1 + h[2] * ph2
-    innovation = y - (theta[side, 0] * h[0] + theta[side, 1] * h[1] + theta[side, 2] * h[2])
-    for i in range(3):
-        theta[side, i] += ph[i] / scale * innovation
-    for i in range(3):
-        for j in range(i, 3):
-            value = (p[side, i, j] - ph[i] * ph[j] / scale) / b.forgetting_ratio
-            p[side, i, j] = value
-            p[side, j, i] = value
-    return innovation * innovation * b.forgetting_ratio / scale
+def _filter_switched(b: Record, side: int, from_m: float, to_m: float, smooth_rate: float) -> None:
+    """Advance a side's switched regressors while the joint goes from one x_b to another in a line.
+
+    In contact from the edge on; a damped joint lets go while it still overlaps: K p + c p' < 0, a contact never pulls.
+    """
+    sign = 1.0 if side == 1 else -1.0
+    line_m = b.right_line_m if side == 1 else b.left_line_m
+    origin_m = b.origin_m + (b.right_origin_m if side == 1 else b.left_origin_m)
+    stiffness = b.right_stiffness_n_per_m if side == 1 else b.left_stiffness_n_per_m
+    damping = b.right_damping_n_s_per_m if side == 1 else b.left_damping_n_s_per_m
+    from_p = sign * (from_m + b.origin_m) - line_m
+    to_p = sign * (to_m + b.origin_m) - line_m
+    turn = np.tanh(smooth_rate / _TURN_M_PER_S)
+    low, high = min(from_p, to_p), max(from_p, to_p)
+    rate = (to_m - from_m) / b.period_s
+    least_p = max(0.0, -damping * sign * smooth_rate / stiffness)
+    share, mean_p, pulse = 0.0, 0.0, 0.0
+    if low >= least_p:
+        share, mean_p = 1.0, 0.5 * (low + high)
+    elif high > least_p:
+        share = (high - least_p) / (high - low)
+        mean_p = share * 0.5 * (high + least_p)
+    half_m = 0.5 * _KNEE_WIDTH_M
+    if high > -half_m and low < half_m:
+        length_m = max(high - low, 1e-12)
+        middle = 0.5 * (low + high)
+        inside = min(high, half_m) - max(low, -half_m)
+        pulse = inside / length_m / _KNEE_WIDTH_M if inside < length_m else 1.0 / _KNEE_WIDTH_M
+        if high - low < 1e-12:
+            pulse = 1.0 / _KNEE_WIDTH_M if abs(middle) < half_m else 0.0
+    z = b.switched
+    for k in range(regression.SIDE_COUNT):
+        if k == 0:
+            new = (sign * (mean_p + line_m * share) - origin_m * share) / _POSITION_SCALE_M
+        elif k == 1:
+            new = share
+        elif k == 2:
+            new = share * rate / _VELOCITY_SCALE_M_PER_S
+        elif k == 3:
+            new = sign * pulse * _KNEE_SCALE_N_M
+        else:
+            new = mean_p * turn / _POSITION_SCALE_M
+        z[side, k, 0], z[side, k, 1], z[side, k, 2] = _filtered(b, z[side, k, 0], z[side, k, 1], z[side, k, 2], new, new)
 
 
 @compiled
-def _publish_edge(b: Record, side: int, residual_n2: float) -> tuple[float, float, float, float]:
-    """Return (edge, its sd, stiffness, its sd) of a side in x_b; nan and inf where the force does not grow with x_b.
+def _publish(b: Record, side: int) -> tuple[float, float, float, float, float, float]:
+    """Return (edge, its sd, stiffness, its sd, line, knee) of a side; nan and inf where it is not identifiable.
 
-    A force that is no contact (a cable, a wrong offset) may be held long enough to pass the gate.
+    A force that is no contact (a cable, a wrong offset) may be held long enough to pass the gate: it doesn't grow
+    with x_b.
     """
+    at = _RIGHT if side == 1 else _LEFT
+    sign = 1.0 if side == 1 else -1.0
+    origin_m = b.origin_m + (b.right_origin_m if side == 1 else b.left_origin_m)
     theta = b.theta
-    p = b.covariance
-    slope = theta[side, 0]
-    intercept = theta[side, 1]
-    variance = residual_n2 * _CORRELATION_SAMPLES
+    c = b.covariance
+    slope = theta[at]
+    intercept = theta[at + 1]
+    ratio = max(b.residual_ratio, 1.0)
     stiffness = slope / _POSITION_SCALE_M
-    stiffness_sd = np.sqrt(variance * p[side, 0, 0]) / _POSITION_SCALE_M
-    if not stiffness > _SURE_SDS * stiffness_sd:
-        return np.nan, np.inf, np.nan, np.inf
-    edge = -intercept / slope
-    edge_variance = (
-        variance * (p[side, 1, 1] + 2.0 * edge * p[side, 0, 1] + edge * edge * p[side, 0, 0]) / (slope * slope)
-    )
-    return edge * _POSITION_SCALE_M + b.origin_m, np.sqrt(edge_variance) * _POSITION_SCALE_M, stiffness, stiffness_sd
+    stiffness_sd = np.sqrt(ratio * c[at, at]) / _POSITION_SCALE_M
+    settled_sd = np.sqrt(ratio * b.spread[at, at]) / _POSITION_SCALE_M
+    if not stiffness > _SURE_SDS * max(stiffness_sd, settled_sd):
+        return np.nan, np.inf, np.nan, np.inf, np.nan, 0.0
+    line = -intercept / slope
+    variance = (c[at + 1, at + 1] + 2.0 * line * c[at, at + 1] + line * line * c[at, at]) / (slope * slope)
+    edge_m = sign * (line * _POSITION_SCALE_M + origin_m)
+    sd_m = np.sqrt(ratio * variance) * _POSITION_SCALE_M
+    line_m = edge_m
+    knee_m = 0.0
+    knee = theta[at + 3]
+    if knee > _SURE_SDS * np.sqrt(ratio * c[at + 3, at + 3]):
+        knee_m = np.sqrt(24.0 * knee * _KNEE_SCALE_N_M / stiffness)
+        edge_m -= 0.5 * knee_m
+        share = 0.25 * knee_m / knee  # d(edge) / d(knee)
+        sd_m = np.sqrt(sd_m * sd_m + share * share * ratio * c[at + 3, at + 3])
+    return edge_m, sd_m, stiffness, stiffness_sd, line_m, knee_m
+
+
+@compiled
+def _take(b: Record, y: float, side: int, q: Record, right_share: float, left_share: float) -> None:
+    """Let a sample teach; shares say how far the sensors' noise passes the contact. `side` -1 = both."""
+    theta = b.theta
+    w = b.corner_rad_per_s
+    mass = w * w * (q.micro_mass_kg + theta[0])
+    spring = q.spring_n_per_m + theta[1]
+    damping = q.damping_n_s_per_m + theta[2]
+    # What is wild at first would make its own noise look wild.
+    if right_share > 0.0 and b.right_sd_m < np.inf:
+        spring += right_share * theta[_RIGHT] / _POSITION_SCALE_M
+        damping += right_share * theta[_RIGHT + 2] / _VELOCITY_SCALE_M_PER_S
+    if left_share > 0.0 and b.left_sd_m < np.inf:
+        spring += left_share * theta[_LEFT] / _POSITION_SCALE_M
+        damping += left_share * theta[_LEFT + 2] / _VELOCITY_SCALE_M_PER_S
+    end_spring = b.end_spring_n_per_m + theta[3]
+    end_damping = w * (b.end_damping_n_s_per_m + theta[4])
+    c = b.noise_gain
+    c[1] = mass
+    c[2] = -2.0 * mass + end_damping + w * damping
+    c[3] = mass + end_spring - end_damping + spring - w * damping
+    c[6] = -w * damping
+    c[7] = -spring + w * damping
+    c[10] = -1.0
+    variance = regression.residual_variance(b)
+    v = b.noise_work
+    counted = 1.0 if side == -1 else 0.0  # with little known, a step against what is expected would run away
+    joint = v[7] - v[3]
+    joint_rate = w * (v[6] - v[2]) - w * joint
+    n = b.common_noise
+    n[0] = -counted * w * w * (v[1] - 2.0 * v[2] + v[3])
+    n[1] = counted * joint
+    n[2] = counted * joint_rate
+    n[3] = -counted * v[3]
+    n[4] = -counted * w * (v[2] - v[3])
+    n[_LEFT] = counted * left_share * joint / _POSITION_SCALE_M
+    n[_LEFT + 2] = counted * left_share * joint_rate / _VELOCITY_SCALE_M_PER_S
+    n[_RIGHT] = counted * right_share * joint / _POSITION_SCALE_M
+    n[_RIGHT + 2] = counted * right_share * joint_rate / _VELOCITY_SCALE_M_PER_S
+    square = regression.update(b, y, variance)
+    b.residual_samples += 1.0
+    share = max(1.0 / b.residual_samples, 5e-4)
+    b.residual_ratio += share * (square / variance - b.residual_ratio)
+    b.mass_kg = theta[0]
+    b.mass_sd_kg = np.sqrt(max(b.residual_ratio, 1.0) * b.covariance[0, 0])
+    if side != 1:
+        edge, edge_sd, stiffness, stiffness_sd, line, knee = _publish(b, 0)
+        b.left_m, b.left_sd_m, b.left_line_m, b.left_knee_m = edge, edge_sd, line, knee
+        b.left_stiffness_n_per_m, b.left_stiffness_sd_n_per_m = stiffness, stiffness_sd
+        b.left_damping_n_s_per_m = theta[_LEFT + 2] / _VELOCITY_SCALE_M_PER_S
+    if side != 0:
+        edge, edge_sd, stiffness, stiffness_sd, line, knee = _publish(b, 1)
+        b.right_m, b.right_sd_m, b.right_line_m, b.right_knee_m = edge, edge_sd, line, knee
+        b.right_stiffness_n_per_m, b.right_stiffness_sd_n_per_m = stiffness, stiffness_sd
+        b.right_damping_n_s_per_m = theta[_RIGHT + 2] / _VELOCITY_SCALE_M_PER_S
 
 
 @compiled
@@ -194,11 +342,14 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
     if b.started == 0.0 or cycle != b.cycle + 1:
         if b.started == 0.0:
             b.origin_m = x_b
+            b.end_origin_m = end_position_m
         b.end_in = end_position_m
         b.end_1 = b.end_2 = b.end_3 = end_position_m
         b.joint_in = x_b - b.origin_m
         b.joint_1 = b.joint_2 = b.joint_3 = x_b - b.origin_m
         b.force_1 = b.force_2 = b.force_3 = mean_force_n
+        b.switched[:, :, :] = 0.0
+        b.warm = 0.0
         b.started = 1.0
         b.cycle = cycle
         b.held = 0.0
@@ -209,61 +360,106 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
     b.end_1, b.end_2, b.end_3 = _filtered(b, b.end_1, b.end_2, b.end_3, b.end_in, end_position_m)
     b.end_in = end_position_m
     joint = x_b - b.origin_m
-    b.joint_1, b.joint_2, b.joint_3 = _filtered(b, b.joint_1, b.joint_2, b.joint_3, b.joint_in, joint)
+    joint_before = b.joint_in
+    b.joint_1, b.joint_2, b.joint_3 = _filtered(b, b.joint_1, b.joint_2, b.joint_3, joint_before, joint)
     b.joint_in = joint
     b.force_1, b.force_2, b.force_3 = _filtered(b, b.force_1, b.force_2, b.force_3, mean_force_n, mean_force_n)
     w = b.corner_rad_per_s
     acceleration = w * w * (b.end_1 - 2.0 * b.end_2 + b.end_3)
     joint_rate = w * (b.joint_2 - b.joint_3)
-    joint_filtered = b.joint_3 + b.origin_m
+    end_rate = w * (b.end_2 - b.end_3)
     y = (
         q.micro_mass_kg * acceleration
         - b.force_3
-        - q.spring_n_per_m * joint_filtered
+        - q.spring_n_per_m * (b.joint_3 + b.origin_m)
         - q.damping_n_s_per_m * joint_rate
+        + b.end_spring_n_per_m * b.end_3
+        + b.end_damping_n_s_per_m * end_rate
     )
-    b.contact_force_n = y
+    h = b.regressors
+    h[0] = -acceleration
+    h[1] = b.joint_3
+    h[2] = joint_rate
+    h[3] = -(b.end_3 - b.end_origin_m)
+    h[4] = -end_rate
+    h[5] = 1.0
+    doubt_n2 = 0.0
+    contact_n = y
+    for i in range(regression.COMMON_COUNT):
+        contact_n -= h[i] * b.theta[i]
+        for j in range(regression.COMMON_COUNT):
+            doubt_n2 += h[i] * b.covariance[i, j] * h[j]
+    b.contact_force_n = contact_n
+    right_known = b.right_sd_m < b.margin_m
+    left_known = b.left_sd_m < b.margin_m
+    if right_known and left_known:
+        smooth_rate = w * (2.0 * (joint - b.joint_1) - (b.joint_1 - b.joint_2))  # extrapolated: no lag
+        for side_of in range(2):
+            _filter_switched(b, side_of, joint_before, joint, smooth_rate)
+        b.warm += 1.0
+    elif b.warm > 0.0:
+        b.switched[:, :, :] = 0.0
+        b.warm = 0.0
     if b.unsettled > 0.0:  # filters that start in motion show a step of speed: 13 N at 3 mm/s, 0.01 N after 16 tau
         b.unsettled -= 1.0
         return
-    least_n = b.least_force_n + b.doubted_mass_kg * abs(acceleration)
-    if abs(y) > least_n:
-        b.greatest_force_n = max(b.greatest_force_n, abs(y))
+    if b.warm > b.settle_cycles:
+        if b.warm == b.settle_cycles + 1.0:
+            regression.forget_noise(b)
+        regression.carry_noise(b)
+        z = b.switched
+        for k in range(regression.SIDE_COUNT):
+            h[_LEFT + k] = z[0, k, 2]
+            h[_RIGHT + k] = z[1, k, 2]
+        if z[0, 1, 2] > 0.5:
+            b.left_samples += 1.0
+        if z[1, 1, 2] > 0.5:
+            b.right_samples += 1.0
+        _take(b, y, -1, q, z[1, 1, 2], z[0, 1, 2])
+        return
+    least_n = b.least_force_n + _SURE_SDS * np.sqrt(doubt_n2)
+    if abs(contact_n) > least_n:
+        b.greatest_force_n = max(b.greatest_force_n, abs(contact_n))
     side = 0.0
     # A damped joint lets go while it still overlaps: k p + c p' < 0, and a contact never pulls.
-    if b.right_sd_m < b.margin_m and x_b > b.right_m + b.margin_m and y > least_n:
+    if right_known and x_b > b.right_m + b.margin_m and contact_n > least_n:
         side = 1.0
-    elif b.left_sd_m < b.margin_m and x_b < -b.left_m - b.margin_m and y < -least_n:
+    elif left_known and x_b < -b.left_m - b.margin_m and contact_n < -least_n:
         side = -1.0
-    elif abs(y) > max(b.force_share_ratio * b.greatest_force_n, least_n):
-        side = 1.0 if y > 0.0 else -1.0
-        if (side > 0.0 and b.right_sd_m < b.margin_m) or (side < 0.0 and b.left_sd_m < b.margin_m):
+    elif abs(contact_n) > max(b.force_share_ratio * b.greatest_force_n, least_n):
+        side = 1.0 if contact_n > 0.0 else -1.0
+        if side != b.side:
+            b.held_from_m = x_b
+        elif side * (x_b - b.held_from_m) < 0.0:
+            side = 0.0  # on its way out: the filtered force lags behind
+        if (side > 0.0 and right_known) or (side < 0.0 and left_known):
             side = 0.0  # an edge that is known is gated by geometry alone
     b.held = b.held + 1.0 if side == b.side and side != 0.0 else 0.0
     b.side = side
     if b.held < b.hold_cycles:
         return
-    h0 = b.joint_3 / _POSITION_SCALE_M
-    h2 = joint_rate / _VELOCITY_SCALE_M_PER_S
-    share = 1.0 / 2000.0
+    if b.held == b.hold_cycles:
+        regression.forget_noise(b)
+    regression.carry_noise(b)
+    for k in range(2 * regression.SIDE_COUNT):
+        h[_LEFT + k] = 0.0
+    at = _RIGHT if side > 0.0 else _LEFT
     if side > 0.0:
-        square = _update(b, 1, h0, 1.0, h2, y)
-        b.right_samples += 1.0
-        if b.right_samples > 50.0:
-            b.right_residual_n2 += max(share, 1.0 / (b.right_samples - 50.0)) * (square - b.right_residual_n2)
-            edge, edge_sd, stiffness, stiffness_sd = _publish_edge(b, 1, b.right_residual_n2)
-            b.right_m, b.right_sd_m = edge, edge_sd
-            b.right_stiffness_n_per_m, b.right_stiffness_sd_n_per_m = stiffness, stiffness_sd
-            b.right_damping_n_s_per_m = b.theta[1, 2] / _VELOCITY_SCALE_M_PER_S
+        if b.right_samples == 0.0:
+            b.right_origin_m = joint
+        h[at] = (b.joint_3 - b.right_origin_m) / _POSITION_SCALE_M
     else:
-        square = _update(b, 0, h0, 1.0, h2, y)
+        if b.left_samples == 0.0:
+            b.left_origin_m = joint
+        h[at] = (b.joint_3 - b.left_origin_m) / _POSITION_SCALE_M
+    h[at + 1] = 1.0
+    h[at + 2] = joint_rate / _VELOCITY_SCALE_M_PER_S
+    if side > 0.0:
+        b.right_samples += 1.0
+        _take(b, y, 1, q, 1.0, 0.0)
+    else:
         b.left_samples += 1.0
-        if b.left_samples > 50.0:
-            b.left_residual_n2 += max(share, 1.0 / (b.left_samples - 50.0)) * (square - b.left_residual_n2)
-            edge, edge_sd, stiffness, stiffness_sd = _publish_edge(b, 0, b.left_residual_n2)
-            b.left_m, b.left_sd_m = -edge, edge_sd
-            b.left_stiffness_n_per_m, b.left_stiffness_sd_n_per_m = stiffness, stiffness_sd
-            b.left_damping_n_s_per_m = b.theta[0, 2] / _VELOCITY_SCALE_M_PER_S
+        _take(b, y, 0, q, 0.0, 1.0)
 
 
 @compiled

@@ -40,16 +40,12 @@ class Gated:
 
 @compiled
 def _along(
-    b: np.ndarray, q: np.ndarray, macro_m: np.ndarray, end_m: np.ndarray, spring: float, damping: float, out: np.ndarray
+    b: np.ndarray, q: np.ndarray, macro_m: np.ndarray, end_m: np.ndarray, out: np.ndarray
 ) -> None:
     record = b[0]
     belief = q[0]
-    before = end_m[0]
     for k in range(end_m.size):
-        rate = (end_m[k] - before) / record.period_s
-        force_n = -0.5 * spring * (end_m[k] + before) - damping * rate
-        backlash.step(record, k, macro_m[k], end_m[k], force_n, belief)
-        before = end_m[k]
+        backlash.step(record, k, macro_m[k], end_m[k], 0.0, belief)
         out[k, 0], out[k, 1] = record.left_m, record.right_m
         out[k, 2], out[k, 3] = record.left_stiffness_n_per_m, record.right_stiffness_n_per_m
 
@@ -60,13 +56,22 @@ def along(
     spring_n_per_m: float,
     damping_n_s_per_m: float,
     forgetting_ratio: float = 1.0,
+    noise_m: float = 100e-9,
+    mass_error_ratio: float = 0.0,
+    doubts: backlash.Doubts = backlash.Doubts(),
 ) -> Gated:
     """Run the estimator over samples of a millisecond; spring and damping are those of F_2."""
     profile = load_profile(_PROFILE)
     belief = estimator.belief(profile)
     belief["spring_n_per_m"] = belief["damping_n_s_per_m"] = 0.0  # (10) has none between the stages
-    b = backlash.init(profile, forgetting_ratio=forgetting_ratio)
+    belief["micro_mass_kg"] *= 1.0 + mass_error_ratio
+    b = backlash.init(profile, forgetting_ratio=forgetting_ratio, doubts=doubts, force_noise_n=0.0)
+    b["position_noise_m"] = noise_m
+    b["end_spring_n_per_m"] = spring_n_per_m
+    b["end_damping_n_s_per_m"] = damping_n_s_per_m
     out = np.empty((end_position_m.size, 4))
-    _along(b, belief, macro_position_m, end_position_m, spring_n_per_m, damping_n_s_per_m, out)
+    _along(b, belief, macro_position_m, end_position_m, out)
+    global LAST
+    LAST = b
     sd = Backlash(*(float(b[name][0]) for name in _SDS))
     return Gated(out[:, 0], out[:, 1], out[:, 2], out[:, 3], sd)

@@ -1,0 +1,190 @@
+"""Recursive least squares on filtered samples whose noise is coloured by the filter, with its true covariance.
+
+A residual is r = c' z, z the filters' answer to white noise of the sensors and of the force. Neighbours share that
+noise, so the textbook covariance r^2 P is wrong (it was 20 times too wide, or too narrow by as much). With e the error
+of theta, the recursion e <- (I - k h') e + k r is linear: its covariance C = E[e e'] and N = E[e z'] follow exactly,
+whatever the gain k is, and whatever else (a drifting edge, a prior) enters e. Gain from P, error bars from C. Pure.
+"""
+
+import numpy as np
+
+from stagectl.compiled import compiled
+from stagectl.signals import Record
+
+COMMON = ("mass", "spring", "damping", "end_spring", "end_damping", "force")
+"""What is wrong with the believed micro: kg, N/m, N s/m between the stages and to the base, N."""
+
+SIDE = ("stiffness", "intercept", "damping", "knee", "hysteresis")
+"""Of a side of the joint, in the scales below."""
+
+COMMON_COUNT = len(COMMON)
+SIDE_COUNT = len(SIDE)
+COUNT = COMMON_COUNT + 2 * SIDE_COUNT
+NOISE_COUNT = 11
+"""Two position chains of input and three lags, and the force's three lags."""
+
+_WEIGHT_N2 = 1e-5
+_NOTHING_KNOWN = 1e2
+
+
+def dtype_fields() -> list[tuple]:
+    """Return the fields that the recursion keeps in the record that it is given."""
+    return [
+        ("theta", "f8", (COUNT,)),
+        ("spread", "f8", (COUNT, COUNT)),  # P: of the gain
+        ("covariance", "f8", (COUNT, COUNT)),  # C = E[e e']
+        ("shared", "f8", (COUNT, NOISE_COUNT)),  # N = E[e z']
+        ("regressors", "f8", (COUNT,)),
+        ("noise_gain", "f8", (NOISE_COUNT,)),  # c of r = c' z
+        ("common_noise", "f8", (COUNT,)),  # E[h r]: what regressors and residual have of the same noise
+        ("position_variance", "f8", (4, 4)),  # of a chain under white noise of 1 m
+        ("force_variance", "f8", (3, 3)),
+        ("gain", "f8", (COUNT,)),
+        ("work", "f8", (COUNT,)),
+        ("noise_work", "f8", (NOISE_COUNT,)),
+        ("position_noise_m", "f8"),
+        ("force_noise_n", "f8"),
+    ]
+
+
+def prepare(b: np.ndarray, variances: np.ndarray) -> None:
+    """Start from theta = 0 with these variances of its elements, shape (COUNT,); infinite = nothing known.
+
+    Nothing known is a large start of P and none of C: what it adds to the error is gone once samples have settled the
+    element, and would be lost in rounding until then.
+    """
+    b["theta"] = 0.0
+    b["shared"] = 0.0
+    b["spread"][0] = np.diag(np.where(np.isinf(variances), _NOTHING_KNOWN, variances))
+    b["covariance"][0] = np.diag(np.where(np.isinf(variances), 0.0, variances))
+    one = b[0]
+    chain = np.zeros((4, 4))
+    chain[1:, 1:] = _chain_decay(one)
+    chain[1:, 0] = [one["old_1"], one["old_2"], one["old_3"]]
+    b["position_variance"][0] = _stationary(chain, np.array([1.0, one["new_1"], one["new_2"], one["new_3"]]))
+    held = np.array([one[f"old_{k}"] + one[f"new_{k}"] for k in (1, 2, 3)])
+    b["force_variance"][0] = _stationary(_chain_decay(one), held)
+
+
+def _chain_decay(one: np.void) -> np.ndarray:
+    d0, d1, d2 = one["decay_0"], one["decay_1"], one["decay_2"]
+    return np.array([[d0, 0.0, 0.0], [d1, d0, 0.0], [d2, d1, d0]])
+
+
+def _stationary(a: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Return X = a X a' + g g' by doubling."""
+    x = np.outer(g, g)
+    for _ in range(40):
+        x = x + a @ x @ a.T
+        a = a @ a
+    return x
+
+
+@compiled
+def forget_noise(b: Record) -> None:
+    """The filters' noise is new: nothing of it is in theta."""
+    b.shared[:, :] = 0.0
+
+
+@compiled
+def carry_noise(b: Record) -> None:
+    """Let the filters' noise grow older by a period: N <- N A'."""
+    n = b.shared
+    d0, d1, d2 = b.decay_0, b.decay_1, b.decay_2
+    o1, o2, o3 = b.old_1, b.old_2, b.old_3
+    for i in range(COUNT):
+        for at in (0, 4):
+            before, z1, z2, z3 = n[i, at], n[i, at + 1], n[i, at + 2], n[i, at + 3]
+            n[i, at] = 0.0
+            n[i, at + 1] = d0 * z1 + o1 * before
+            n[i, at + 2] = d1 * z1 + d0 * z2 + o2 * before
+            n[i, at + 3] = d2 * z1 + d1 * z2 + d0 * z3 + o3 * before
+        z1, z2, z3 = n[i, 8], n[i, 9], n[i, 10]
+        n[i, 8] = d0 * z1
+        n[i, 9] = d1 * z1 + d0 * z2
+        n[i, 10] = d2 * z1 + d1 * z2 + d0 * z3
+
+
+@compiled
+def residual_variance(b: Record) -> float:
+    """Fill noise_work with Z c; return c' Z c, N^2."""
+    c = b.noise_gain
+    x = b.position_variance
+    f = b.force_variance
+    v = b.noise_work
+    position = b.position_noise_m * b.position_noise_m
+    force = b.force_noise_n * b.force_noise_n
+    total = 0.0
+    for at in (0, 4):
+        for i in range(4):
+            s = 0.0
+            for j in range(4):
+                s += x[i, j] * c[at + j]
+            v[at + i] = position * s
+            total += v[at + i] * c[at + i]
+    for i in range(3):
+        s = 0.0
+        for j in range(3):
+            s += f[i, j] * c[8 + j]
+        v[8 + i] = force * s
+        total += v[8 + i] * c[8 + i]
+    return total
+
+
+@compiled
+def update(b: Record, y: float, variance: float) -> float:
+    """Take y = regressors' theta + residual, N, whose noise is noise_gain' z of this variance; returns residual x innovation, N^2."""
+    h = b.regressors
+    p = b.spread
+    cov = b.covariance
+    n = b.shared
+    theta = b.theta
+    k = b.gain
+    w = b.work
+    predicted = 0.0
+    scale = _WEIGHT_N2
+    for i in range(COUNT):
+        s = 0.0
+        for j in range(COUNT):
+            s += p[i, j] * h[j]
+        k[i] = s
+        scale += h[i] * s
+        predicted += h[i] * theta[i]
+    innovation = y - predicted
+    # C <- Phi C Phi' + Phi N c k' + k c' N' Phi' + k (c' Z c) k', Phi = I - k h', as C + k g' + g k' + s k k'
+    s = variance
+    for i in range(COUNT):
+        t = 0.0
+        for j in range(COUNT):
+            t += cov[i, j] * h[j]
+        u = 0.0
+        for j in range(NOISE_COUNT):
+            u += n[i, j] * b.noise_gain[j]
+        s += h[i] * (t - 2.0 * u)
+        w[i] = u - t
+    for i in range(COUNT):
+        for j in range(i, COUNT):
+            value = p[i, j] - k[i] * k[j] / scale
+            p[i, j] = value
+            p[j, i] = value
+    for i in range(COUNT):
+        k[i] /= scale
+        theta[i] += k[i] * innovation
+    for i in range(COUNT):
+        for j in range(i, COUNT):
+            value = cov[i, j] + k[i] * w[j] + w[i] * k[j] + s * k[i] * k[j]
+            cov[i, j] = value
+            cov[j, i] = value
+    # Noise that regressor and residual share would pull theta, 1 sd within 10 s: what is expected of it is taken out.
+    for i in range(COUNT):
+        t = 0.0
+        for j in range(COUNT):
+            t += p[i, j] * b.common_noise[j]
+        theta[i] -= t / _WEIGHT_N2
+    for j in range(NOISE_COUNT):
+        t = b.noise_work[j]
+        for i in range(COUNT):
+            t -= h[i] * n[i, j]
+        for i in range(COUNT):
+            n[i, j] += k[i] * t
+    return innovation * innovation * _WEIGHT_N2 / scale
