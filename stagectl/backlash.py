@@ -34,7 +34,7 @@ BACKLASH = np.dtype(
         ("period_s", "f8"),
         ("corner_rad_per_s", "f8"),
         ("hold_cycles", "f8"),
-        ("forgetting_ratio", "f8"),
+        ("edge_drift_m_per_sqrt_s", "f8"),  # random walk of each edge that is allowed for
         ("least_force_n", "f8"),
         ("settle_cycles", "f8"),
         ("force_share_ratio", "f8"),
@@ -104,6 +104,7 @@ BACKLASH = np.dtype(
 _POSITION_SCALE_M = 1e-4
 _VELOCITY_SCALE_M_PER_S = 1e-3
 _KNEE_SCALE_N_M = 1e-6
+_MODEL_M = 1e-9  # what a straight line between samples gives away at an edge
 _KNEE_WIDTH_M = 10e-6  # of the pulse that stands for a knee
 _TURN_M_PER_S = 1e-4  # over which a hysteresis turns round
 _SIDE_VARIANCES = (np.inf, np.inf, np.inf)  # stiffness, intercept, damping: nothing known
@@ -143,9 +144,9 @@ class Doubts:
 def init(
     profile: "Profile",
     filter_s: float = 0.01,
-    forgetting_ratio: float = 1.0,
     doubts: Doubts | None = None,
     force_noise_n: float = 5e-3,
+    edge_drift_m_per_sqrt_s: float = 0.0,
 ) -> np.ndarray:
     """Make BACKLASH: nothing known of edges and stiffness, whatever the profile believes."""
     b = np.zeros(1, BACKLASH)
@@ -154,11 +155,11 @@ def init(
     b["period_s"] = h
     b["corner_rad_per_s"] = w
     b["hold_cycles"] = np.ceil(8.0 * filter_s / h)
-    b["forgetting_ratio"] = forgetting_ratio
     b["settle_cycles"] = np.ceil(16.0 * filter_s / h)
     b["least_force_n"] = 0.3
     b["force_share_ratio"] = 0.1
     b["margin_m"] = 10e-6
+    b["edge_drift_m_per_sqrt_s"] = edge_drift_m_per_sqrt_s
     b["position_noise_m"] = profile.interferometer.noise_m
     b["force_noise_n"] = force_noise_n
     # Chain of three: X = expm(A h), input integrals by a Taylor series of the augmented matrix (first-order hold)
@@ -266,7 +267,7 @@ def _publish(b: Record, side: int) -> tuple[float, float, float, float, float, f
     line = -intercept / slope
     variance = (c[at + 1, at + 1] + 2.0 * line * c[at, at + 1] + line * line * c[at, at]) / (slope * slope)
     edge_m = sign * (line * _POSITION_SCALE_M + origin_m)
-    sd_m = np.sqrt(ratio * variance) * _POSITION_SCALE_M
+    sd_m = np.sqrt(ratio * variance * _POSITION_SCALE_M * _POSITION_SCALE_M + _MODEL_M * _MODEL_M)
     line_m = edge_m
     knee_m = 0.0
     knee = theta[at + 3]
@@ -390,6 +391,12 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
         for j in range(regression.COMMON_COUNT):
             doubt_n2 += h[i] * b.covariance[i, j] * h[j]
     b.contact_force_n = contact_n
+    if b.edge_drift_m_per_sqrt_s > 0.0:
+        walk = b.edge_drift_m_per_sqrt_s * np.sqrt(b.period_s)
+        if b.right_sd_m < np.inf:
+            regression.drift(b, _RIGHT + 1, walk * b.right_stiffness_n_per_m)
+        if b.left_sd_m < np.inf:
+            regression.drift(b, _LEFT + 1, walk * b.left_stiffness_n_per_m)
     right_known = b.right_sd_m < b.margin_m
     left_known = b.left_sd_m < b.margin_m
     if right_known and left_known:

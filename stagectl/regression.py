@@ -81,6 +81,13 @@ def _stationary(a: np.ndarray, g: np.ndarray) -> np.ndarray:
 
 
 @compiled
+def drift(b: Record, at: int, walk: float) -> None:
+    """Allow an element of theta a random walk of this standard deviation a period."""
+    b.spread[at, at] += walk * walk
+    b.covariance[at, at] += walk * walk
+
+
+@compiled
 def forget_noise(b: Record) -> None:
     """The filters' noise is new: nothing of it is in theta."""
     b.shared[:, :] = 0.0

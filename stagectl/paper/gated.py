@@ -55,7 +55,7 @@ def along(
     end_position_m: np.ndarray,
     spring_n_per_m: float,
     damping_n_s_per_m: float,
-    forgetting_ratio: float = 1.0,
+    edge_drift_m_per_sqrt_s: float = 0.0,
     noise_m: float = 100e-9,
     mass_error_ratio: float = 0.0,
     doubts: backlash.Doubts = backlash.Doubts(),
@@ -65,7 +65,7 @@ def along(
     belief = estimator.belief(profile)
     belief["spring_n_per_m"] = belief["damping_n_s_per_m"] = 0.0  # (10) has none between the stages
     belief["micro_mass_kg"] *= 1.0 + mass_error_ratio
-    b = backlash.init(profile, forgetting_ratio=forgetting_ratio, doubts=doubts, force_noise_n=0.0)
+    b = backlash.init(profile, edge_drift_m_per_sqrt_s=edge_drift_m_per_sqrt_s, doubts=doubts, force_noise_n=0.0)
     b["position_noise_m"] = noise_m
     b["end_spring_n_per_m"] = spring_n_per_m
     b["end_damping_n_s_per_m"] = damping_n_s_per_m
