@@ -63,6 +63,12 @@ BACKLASH = np.dtype(
         ("force_2", "f8"),
         ("force_3", "f8"),
         ("switched", "f8", (2, regression.SIDE_COUNT, 3)),  # regressors that are nil off their side's contact
+        ("looks_for_hysteresis", "f8"),
+        ("looks_for_knee", "f8"),
+        ("left_seen", "f8"),  # samples in contact since the regressors are switched where they are
+        ("right_seen", "f8"),
+        ("starting", "f8"),  # cycles until the filters have forgotten where they were switched before
+        ("turned", "f8"),  # cycles until a turn in contact is forgotten
         ("warm", "f8"),  # cycles that both edges have been known for
         ("started", "f8"),
         ("cycle", "f8"),
@@ -82,6 +88,7 @@ BACKLASH = np.dtype(
         ("left_sd_m", "f8"),
         ("left_samples", "f8"),
         ("left_origin_m", "f8"),  # joint where the side was first pressed: the intercept is the force there
+        ("left_switch_m", "f8"),  # where its regressors are switched
         ("left_line_m", "f8"),  # where the straight part of the contact meets zero
         ("left_knee_m", "f8"),
         ("right_stiffness_n_per_m", "f8"),
@@ -91,6 +98,7 @@ BACKLASH = np.dtype(
         ("right_sd_m", "f8"),
         ("right_samples", "f8"),
         ("right_origin_m", "f8"),
+        ("right_switch_m", "f8"),  # where its regressors are switched
         ("right_line_m", "f8"),
         ("right_knee_m", "f8"),
         ("mass_kg", "f8"),  # found beyond the believed one, for a force constant that is taken to be right
@@ -105,8 +113,11 @@ _POSITION_SCALE_M = 1e-4
 _VELOCITY_SCALE_M_PER_S = 1e-3
 _KNEE_SCALE_N_M = 1e-6
 _MODEL_M = 1e-9  # what a straight line between samples gives away at an edge
+_KNEE_POINTS_COUNT = 32
 _KNEE_WIDTH_M = 10e-6  # of the pulse that stands for a knee
-_TURN_M_PER_S = 1e-4  # over which a hysteresis turns round
+_MOVED_M = 0.3e-6
+_SEEN_SAMPLES = 300.0
+_TURN_M_PER_S = 3e-4  # over which a hysteresis turns round
 _SIDE_VARIANCES = (np.inf, np.inf, np.inf)  # stiffness, intercept, damping: nothing known
 _SURE_SDS = 5.0  # that a force is beyond what the doubts explain by, and a stiffness above zero
 
@@ -179,6 +190,8 @@ def init(
     if doubts is None:
         doubts = Doubts(mass_kg=profile.micro.mass_sd_kg) if profile.micro is not None else Doubts()
     regression.prepare(b, doubts.variances)
+    b["looks_for_knee"] = float(doubts.knee_n_m > 0.0)
+    b["looks_for_hysteresis"] = float(doubts.hysteresis_n_per_m > 0.0)
     for side in _SIDES:
         b[f"{side}_sd_m"] = np.inf
         b[f"{side}_stiffness_sd_n_per_m"] = np.inf
@@ -205,13 +218,13 @@ def _filter_switched(b: Record, side: int, from_m: float, to_m: float, smooth_ra
     In contact from the edge on; a damped joint lets go while it still overlaps: K p + c p' < 0, a contact never pulls.
     """
     sign = 1.0 if side == 1 else -1.0
-    line_m = b.right_line_m if side == 1 else b.left_line_m
+    line_m = b.right_switch_m if side == 1 else b.left_switch_m
     origin_m = b.origin_m + (b.right_origin_m if side == 1 else b.left_origin_m)
     stiffness = b.right_stiffness_n_per_m if side == 1 else b.left_stiffness_n_per_m
     damping = b.right_damping_n_s_per_m if side == 1 else b.left_damping_n_s_per_m
     from_p = sign * (from_m + b.origin_m) - line_m
     to_p = sign * (to_m + b.origin_m) - line_m
-    turn = np.tanh(smooth_rate / _TURN_M_PER_S)
+    turn = 1.0 if smooth_rate > 0.0 else -1.0
     low, high = min(from_p, to_p), max(from_p, to_p)
     rate = (to_m - from_m) / b.period_s
     least_p = max(0.0, -damping * sign * smooth_rate / stiffness)
@@ -245,6 +258,23 @@ def _filter_switched(b: Record, side: int, from_m: float, to_m: float, smooth_ra
 
 
 @compiled
+def _knee(area: float, area_sd: float, stiffness: float) -> tuple[float, float]:
+    """Return mean and standard deviation of delta, K delta^2 / 24 = area, m; every delta as likely beforehand."""
+    longest_m = np.sqrt(24.0 * max(area + 4.0 * area_sd, area_sd) / stiffness)
+    total, first, second = 0.0, 0.0, 0.0
+    for k in range(_KNEE_POINTS_COUNT):
+        delta_m = longest_m * (k + 0.5) / _KNEE_POINTS_COUNT
+        off = (stiffness * delta_m * delta_m / 24.0 - area) / area_sd
+        weight = np.exp(-0.5 * min(off * off, 600.0))
+        total += weight
+        first += weight * delta_m
+        second += weight * delta_m * delta_m
+    mean_m = first / total
+    step_m = longest_m / _KNEE_POINTS_COUNT
+    return mean_m, np.sqrt(max(second / total - mean_m * mean_m, step_m * step_m / 12.0))
+
+
+@compiled
 def _publish(b: Record, side: int) -> tuple[float, float, float, float, float, float]:
     """Return (edge, its sd, stiffness, its sd, line, knee) of a side; nan and inf where it is not identifiable.
 
@@ -270,13 +300,30 @@ def _publish(b: Record, side: int) -> tuple[float, float, float, float, float, f
     sd_m = np.sqrt(ratio * variance * _POSITION_SCALE_M * _POSITION_SCALE_M + _MODEL_M * _MODEL_M)
     line_m = edge_m
     knee_m = 0.0
-    knee = theta[at + 3]
-    if knee > _SURE_SDS * np.sqrt(ratio * c[at + 3, at + 3]):
-        knee_m = np.sqrt(24.0 * knee * _KNEE_SCALE_N_M / stiffness)
+    if b.looks_for_knee != 0.0 and b.warm > b.settle_cycles:
+        # The pulse's area belongs to where the regressors are switched: a line that begins elsewhere has one too.
+        off_m = edge_m - (b.right_switch_m if side == 1 else b.left_switch_m)
+        area = theta[at + 3] * _KNEE_SCALE_N_M - 0.5 * stiffness * off_m * off_m
+        area_sd = np.sqrt(ratio * c[at + 3, at + 3]) * _KNEE_SCALE_N_M
+        knee_m, knee_sd_m = _knee(area, area_sd, stiffness)
         edge_m -= 0.5 * knee_m
-        share = 0.25 * knee_m / knee  # d(edge) / d(knee)
-        sd_m = np.sqrt(sd_m * sd_m + share * share * ratio * c[at + 3, at + 3])
+        sd_m = np.sqrt(sd_m * sd_m + 0.25 * knee_sd_m * knee_sd_m)
     return edge_m, sd_m, stiffness, stiffness_sd, line_m, knee_m
+
+
+@compiled
+def _publish_known(b: Record) -> None:
+    """Publish both sides once they are sure; until then what was known before stands."""
+    edge, edge_sd, stiffness, stiffness_sd, line, knee = _publish(b, 0)
+    if edge_sd < b.margin_m:
+        b.left_m, b.left_sd_m, b.left_line_m, b.left_knee_m = edge, edge_sd, line, knee
+        b.left_stiffness_n_per_m, b.left_stiffness_sd_n_per_m = stiffness, stiffness_sd
+        b.left_damping_n_s_per_m = b.theta[_LEFT + 2] / _VELOCITY_SCALE_M_PER_S
+    edge, edge_sd, stiffness, stiffness_sd, line, knee = _publish(b, 1)
+    if edge_sd < b.margin_m:
+        b.right_m, b.right_sd_m, b.right_line_m, b.right_knee_m = edge, edge_sd, line, knee
+        b.right_stiffness_n_per_m, b.right_stiffness_sd_n_per_m = stiffness, stiffness_sd
+        b.right_damping_n_s_per_m = b.theta[_RIGHT + 2] / _VELOCITY_SCALE_M_PER_S
 
 
 @compiled
@@ -305,7 +352,8 @@ def _take(b: Record, y: float, side: int, q: Record, right_share: float, left_sh
     c[10] = -1.0
     variance = regression.residual_variance(b)
     v = b.noise_work
-    counted = 1.0 if side == -1 else 0.0  # with little known, a step against what is expected would run away
+    settled = b.looks_for_knee == 0.0 or min(b.left_seen, b.right_seen) > _SEEN_SAMPLES
+    counted = 1.0 if side == -1 and settled else 0.0  # with little known, a step against what is expected would run away
     joint = v[7] - v[3]
     joint_rate = w * (v[6] - v[2]) - w * joint
     n = b.common_noise
@@ -324,12 +372,14 @@ def _take(b: Record, y: float, side: int, q: Record, right_share: float, left_sh
     b.residual_ratio += share * (square / variance - b.residual_ratio)
     b.mass_kg = theta[0]
     b.mass_sd_kg = np.sqrt(max(b.residual_ratio, 1.0) * b.covariance[0, 0])
-    if side != 1:
+    if side == -1:
+        _publish_known(b)
+    elif side == 0:
         edge, edge_sd, stiffness, stiffness_sd, line, knee = _publish(b, 0)
         b.left_m, b.left_sd_m, b.left_line_m, b.left_knee_m = edge, edge_sd, line, knee
         b.left_stiffness_n_per_m, b.left_stiffness_sd_n_per_m = stiffness, stiffness_sd
         b.left_damping_n_s_per_m = theta[_LEFT + 2] / _VELOCITY_SCALE_M_PER_S
-    if side != 0:
+    else:
         edge, edge_sd, stiffness, stiffness_sd, line, knee = _publish(b, 1)
         b.right_m, b.right_sd_m, b.right_line_m, b.right_knee_m = edge, edge_sd, line, knee
         b.right_stiffness_n_per_m, b.right_stiffness_sd_n_per_m = stiffness, stiffness_sd
@@ -400,9 +450,25 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
     right_known = b.right_sd_m < b.margin_m
     left_known = b.left_sd_m < b.margin_m
     if right_known and left_known:
+        # A knee is found from samples that were all switched at one place, hardly off the line's.
+        moved_m = max(abs(b.left_line_m - b.left_switch_m), abs(b.right_line_m - b.right_switch_m))
+        seen = min(b.left_seen, b.right_seen)
+        if b.warm == 0.0 or b.looks_for_knee == 0.0:
+            b.left_switch_m = b.left_line_m
+            b.right_switch_m = b.right_line_m
+        elif moved_m > _MOVED_M and seen > _SEEN_SAMPLES:
+            b.left_switch_m = b.left_line_m
+            b.right_switch_m = b.right_line_m
+            b.left_seen = b.right_seen = 0.0
+            b.starting = b.settle_cycles
         smooth_rate = w * (2.0 * (joint - b.joint_1) - (b.joint_1 - b.joint_2))  # extrapolated: no lag
         for side_of in range(2):
             _filter_switched(b, side_of, joint_before, joint, smooth_rate)
+        # How a hysteresis turns round isn't known: samples whose filters remember a turn in contact don't count.
+        if b.looks_for_hysteresis != 0.0 and abs(smooth_rate) < _TURN_M_PER_S:
+            x_b_inside = x_b < b.right_line_m and x_b > -b.left_line_m
+            b.turned = b.turned if x_b_inside else b.hold_cycles
+        b.turned = max(b.turned - 1.0, 0.0)
         b.warm += 1.0
     elif b.warm > 0.0:
         b.switched[:, :, :] = 0.0
@@ -413,15 +479,28 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
     if b.warm > b.settle_cycles:
         if b.warm == b.settle_cycles + 1.0:
             regression.forget_noise(b)
+            if b.looks_for_knee != 0.0:  # samples so far were taken as if there were none
+                b.starting = 1.0
         regression.carry_noise(b)
+        if b.starting > 0.0:
+            b.starting -= 1.0
+            if b.starting == 0.0:
+                regression.start_sides_again(b)
+                b.residual_samples = b.residual_ratio = 0.0
+                b.left_seen = b.right_seen = 0.0
+            return
+        if b.turned > 0.0:
+            return
         z = b.switched
         for k in range(regression.SIDE_COUNT):
             h[_LEFT + k] = z[0, k, 2]
             h[_RIGHT + k] = z[1, k, 2]
         if z[0, 1, 2] > 0.5:
             b.left_samples += 1.0
+            b.left_seen += 1.0
         if z[1, 1, 2] > 0.5:
             b.right_samples += 1.0
+            b.right_seen += 1.0
         _take(b, y, -1, q, z[1, 1, 2], z[0, 1, 2])
         return
     least_n = b.least_force_n + _SURE_SDS * np.sqrt(doubt_n2)

@@ -39,6 +39,7 @@ def dtype_fields() -> list[tuple]:
         ("common_noise", "f8", (COUNT,)),  # E[h r]: what regressors and residual have of the same noise
         ("position_variance", "f8", (4, 4)),  # of a chain under white noise of 1 m
         ("force_variance", "f8", (3, 3)),
+        ("first_variance", "f8", (COUNT,)),
         ("gain", "f8", (COUNT,)),
         ("work", "f8", (COUNT,)),
         ("noise_work", "f8", (NOISE_COUNT,)),
@@ -55,6 +56,7 @@ def prepare(b: np.ndarray, variances: np.ndarray) -> None:
     """
     b["theta"] = 0.0
     b["shared"] = 0.0
+    b["first_variance"] = np.minimum(variances, _NOTHING_KNOWN)
     b["spread"][0] = np.diag(np.where(np.isinf(variances), _NOTHING_KNOWN, variances))
     b["covariance"][0] = np.diag(np.where(np.isinf(variances), 0.0, variances))
     one = b[0]
@@ -78,6 +80,20 @@ def _stationary(a: np.ndarray, g: np.ndarray) -> np.ndarray:
         x = x + a @ x @ a.T
         a = a @ a
     return x
+
+
+@compiled
+def start_sides_again(b: Record) -> None:
+    """Forget what is known of both sides."""
+    n = b.shared
+    n[:, :] = 0.0
+    for i in range(COMMON_COUNT, COUNT):
+        b.theta[i] = 0.0
+        for j in range(COUNT):
+            b.spread[i, j] = b.spread[j, i] = 0.0
+            b.covariance[i, j] = b.covariance[j, i] = 0.0
+        b.spread[i, i] = b.first_variance[i]
+        b.covariance[i, i] = b.first_variance[i] if b.first_variance[i] < _NOTHING_KNOWN else 0.0
 
 
 @compiled
