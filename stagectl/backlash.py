@@ -63,6 +63,7 @@ BACKLASH = np.dtype(
         ("force_2", "f8"),
         ("force_3", "f8"),
         ("switched", "f8", (2, regression.SIDE_COUNT, 3)),  # regressors that are nil off their side's contact
+        ("gap_margin_m", "f8"),  # from a believed edge, within which the joint is taken to be free; inf = belief unused
         ("looks_for_hysteresis", "f8"),
         ("looks_for_knee", "f8"),
         ("left_seen", "f8"),  # samples in contact since the regressors are switched where they are
@@ -119,6 +120,7 @@ _MOVED_M = 0.3e-6
 _SEEN_SAMPLES = 300.0
 _TURN_M_PER_S = 3e-4  # over which a hysteresis turns round
 _SIDE_VARIANCES = (np.inf, np.inf, np.inf)  # stiffness, intercept, damping: nothing known
+_FREE = 2.0  # a side that is none
 _SURE_SDS = 5.0  # that a force is beyond what the doubts explain by, and a stiffness above zero
 
 
@@ -190,6 +192,9 @@ def init(
     if doubts is None:
         doubts = Doubts(mass_kg=profile.micro.mass_sd_kg) if profile.micro is not None else Doubts()
     regression.prepare(b, doubts.variances)
+    b["gap_margin_m"] = np.inf
+    if doubts.force_n > 0.0 and profile.backlash is not None:  # an offset and an edge differ in the gap alone
+        b["gap_margin_m"] = 3.0 * profile.backlash.width_sd_m
     b["looks_for_knee"] = float(doubts.knee_n_m > 0.0)
     b["looks_for_hysteresis"] = float(doubts.hysteresis_n_per_m > 0.0)
     for side in _SIDES:
@@ -379,7 +384,7 @@ def _take(b: Record, y: float, side: int, q: Record, right_share: float, left_sh
         b.left_m, b.left_sd_m, b.left_line_m, b.left_knee_m = edge, edge_sd, line, knee
         b.left_stiffness_n_per_m, b.left_stiffness_sd_n_per_m = stiffness, stiffness_sd
         b.left_damping_n_s_per_m = theta[_LEFT + 2] / _VELOCITY_SCALE_M_PER_S
-    else:
+    elif side == 1:
         edge, edge_sd, stiffness, stiffness_sd, line, knee = _publish(b, 1)
         b.right_m, b.right_sd_m, b.right_line_m, b.right_knee_m = edge, edge_sd, line, knee
         b.right_stiffness_n_per_m, b.right_stiffness_sd_n_per_m = stiffness, stiffness_sd
@@ -520,6 +525,8 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
             side = 0.0  # on its way out: the filtered force lags behind
         if (side > 0.0 and right_known) or (side < 0.0 and left_known):
             side = 0.0  # an edge that is known is gated by geometry alone
+    elif -q.left_m + b.gap_margin_m < x_b < q.right_m - b.gap_margin_m and abs(contact_n) < least_n:
+        side = _FREE
     b.held = b.held + 1.0 if side == b.side and side != 0.0 else 0.0
     b.side = side
     if b.held < b.hold_cycles:
@@ -529,6 +536,9 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
     regression.carry_noise(b)
     for k in range(2 * regression.SIDE_COUNT):
         h[_LEFT + k] = 0.0
+    if side == _FREE:
+        _take(b, y, 2, q, 0.0, 0.0)
+        return
     at = _RIGHT if side > 0.0 else _LEFT
     if side > 0.0:
         if b.right_samples == 0.0:
