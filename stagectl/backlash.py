@@ -167,7 +167,7 @@ def init(
     w = 1.0 / filter_s
     b["period_s"] = h
     b["corner_rad_per_s"] = w
-    b["hold_cycles"] = np.ceil(8.0 * filter_s / h)
+    b["hold_cycles"] = np.ceil(7.0 * filter_s / h)
     b["settle_cycles"] = np.ceil(16.0 * filter_s / h)
     b["least_force_n"] = 0.3
     b["force_share_ratio"] = 0.1
@@ -296,8 +296,7 @@ def _publish(b: Record, side: int) -> tuple[float, float, float, float, float, f
     ratio = max(b.residual_ratio, 1.0)
     stiffness = slope / _POSITION_SCALE_M
     stiffness_sd = np.sqrt(ratio * c[at, at]) / _POSITION_SCALE_M
-    settled_sd = np.sqrt(ratio * b.spread[at, at]) / _POSITION_SCALE_M
-    if not stiffness > _SURE_SDS * max(stiffness_sd, settled_sd):
+    if not stiffness > _SURE_SDS * stiffness_sd:
         return np.nan, np.inf, np.nan, np.inf, np.nan, 0.0
     line = -intercept / slope
     variance = (c[at + 1, at + 1] + 2.0 * line * c[at, at + 1] + line * line * c[at, at]) / (slope * slope)
@@ -356,21 +355,6 @@ def _take(b: Record, y: float, side: int, q: Record, right_share: float, left_sh
     c[7] = -spring + w * damping
     c[10] = -1.0
     variance = regression.residual_variance(b)
-    v = b.noise_work
-    settled = b.looks_for_knee == 0.0 or min(b.left_seen, b.right_seen) > _SEEN_SAMPLES
-    counted = 1.0 if side == -1 and settled else 0.0  # with little known, a step against what is expected would run away
-    joint = v[7] - v[3]
-    joint_rate = w * (v[6] - v[2]) - w * joint
-    n = b.common_noise
-    n[0] = -counted * w * w * (v[1] - 2.0 * v[2] + v[3])
-    n[1] = counted * joint
-    n[2] = counted * joint_rate
-    n[3] = -counted * v[3]
-    n[4] = -counted * w * (v[2] - v[3])
-    n[_LEFT] = counted * left_share * joint / _POSITION_SCALE_M
-    n[_LEFT + 2] = counted * left_share * joint_rate / _VELOCITY_SCALE_M_PER_S
-    n[_RIGHT] = counted * right_share * joint / _POSITION_SCALE_M
-    n[_RIGHT + 2] = counted * right_share * joint_rate / _VELOCITY_SCALE_M_PER_S
     square = regression.update(b, y, variance)
     b.residual_samples += 1.0
     share = max(1.0 / b.residual_samples, 5e-4)
@@ -484,8 +468,7 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
     if b.warm > b.settle_cycles:
         if b.warm == b.settle_cycles + 1.0:
             regression.forget_noise(b)
-            if b.looks_for_knee != 0.0:  # samples so far were taken as if there were none
-                b.starting = 1.0
+            b.starting = 1.0
         regression.carry_noise(b)
         if b.starting > 0.0:
             b.starting -= 1.0

@@ -36,7 +36,6 @@ def dtype_fields() -> list[tuple]:
         ("shared", "f8", (COUNT, NOISE_COUNT)),  # N = E[e z']
         ("regressors", "f8", (COUNT,)),
         ("noise_gain", "f8", (NOISE_COUNT,)),  # c of r = c' z
-        ("common_noise", "f8", (COUNT,)),  # E[h r]: what regressors and residual have of the same noise
         ("position_variance", "f8", (4, 4)),  # of a chain under white noise of 1 m
         ("force_variance", "f8", (3, 3)),
         ("first_variance", "f8", (COUNT,)),
@@ -49,16 +48,12 @@ def dtype_fields() -> list[tuple]:
 
 
 def prepare(b: np.ndarray, variances: np.ndarray) -> None:
-    """Start from theta = 0 with these variances of its elements, shape (COUNT,); infinite = nothing known.
-
-    Nothing known is a large start of P and none of C: what it adds to the error is gone once samples have settled the
-    element, and would be lost in rounding until then.
-    """
+    """Start from theta = 0 with these variances of its elements, shape (COUNT,); infinite = nothing known."""
     b["theta"] = 0.0
     b["shared"] = 0.0
     b["first_variance"] = np.minimum(variances, _NOTHING_KNOWN)
     b["spread"][0] = np.diag(np.where(np.isinf(variances), _NOTHING_KNOWN, variances))
-    b["covariance"][0] = np.diag(np.where(np.isinf(variances), 0.0, variances))
+    b["covariance"][0] = b["spread"][0]
     one = b[0]
     chain = np.zeros((4, 4))
     chain[1:, 1:] = _chain_decay(one)
@@ -93,7 +88,7 @@ def start_sides_again(b: Record) -> None:
             b.spread[i, j] = b.spread[j, i] = 0.0
             b.covariance[i, j] = b.covariance[j, i] = 0.0
         b.spread[i, i] = b.first_variance[i]
-        b.covariance[i, i] = b.first_variance[i] if b.first_variance[i] < _NOTHING_KNOWN else 0.0
+        b.covariance[i, i] = b.first_variance[i]
 
 
 @compiled
@@ -198,12 +193,6 @@ def update(b: Record, y: float, variance: float) -> float:
             value = cov[i, j] + k[i] * w[j] + w[i] * k[j] + s * k[i] * k[j]
             cov[i, j] = value
             cov[j, i] = value
-    # Noise that regressor and residual share would pull theta, 1 sd within 10 s: what is expected of it is taken out.
-    for i in range(COUNT):
-        t = 0.0
-        for j in range(COUNT):
-            t += p[i, j] * b.common_noise[j]
-        theta[i] -= t / _WEIGHT_N2
     for j in range(NOISE_COUNT):
         t = b.noise_work[j]
         for i in range(COUNT):
