@@ -6,6 +6,8 @@ of theta, the recursion e <- (I - k h') e + k r is linear: its covariance C = E[
 whatever the gain k is, and whatever else (a drifting edge, a prior) enters e. Gain from P, error bars from C. Pure.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from stagectl.compiled import compiled
@@ -15,16 +17,49 @@ COMMON = ("mass", "spring", "damping", "end_spring", "end_damping", "force")
 """What is wrong with the believed micro: kg, N/m, N s/m between the stages and to the base, N."""
 
 SIDE = ("stiffness", "intercept", "damping", "knee", "hysteresis")
-"""Of a side of the joint, in the scales below."""
+"""Of a side of the joint, in the scales below; regressors are divided by them."""
+
+POSITION_SCALE_M = 1e-4
+VELOCITY_SCALE_M_PER_S = 1e-3
+KNEE_SCALE_N_M = 1e-6
 
 COMMON_COUNT = len(COMMON)
 SIDE_COUNT = len(SIDE)
+LEFT, RIGHT = COMMON_COUNT, COMMON_COUNT + SIDE_COUNT
 COUNT = COMMON_COUNT + 2 * SIDE_COUNT
 NOISE_COUNT = 11
 """Two position chains of input and three lags, and the force's three lags."""
 
 _WEIGHT_N2 = 1e-5
 _NOTHING_KNOWN = 1e2
+
+
+@dataclass(frozen=True, slots=True)
+class Doubts:
+    """Standard deviations of what is believed; 0 = exact, not looked for."""
+
+    mass_kg: float = 0.0
+    spring_n_per_m: float = 0.0
+    damping_n_s_per_m: float = 0.0
+    end_spring_n_per_m: float = 0.0
+    """To the base: a cable on the end."""
+    end_damping_n_s_per_m: float = 0.0
+    force_n: float = 0.0
+    knee_n_m: float = 0.0
+    """Of K delta^2 / 24, the excess area over p of a contact that sets in along a parabola of length delta."""
+    hysteresis_n_per_m: float = 0.0
+    """Of the stiffness that a side has more when pressed, and less when let go."""
+
+    @property
+    def variances(self) -> np.ndarray:
+        """Those of theta, shape (COUNT,); infinite = nothing known."""
+        common = (
+            *(self.mass_kg, self.spring_n_per_m, self.damping_n_s_per_m),
+            *(self.end_spring_n_per_m, self.end_damping_n_s_per_m, self.force_n),
+        )
+        soft = (self.knee_n_m / KNEE_SCALE_N_M, self.hysteresis_n_per_m * POSITION_SCALE_M)
+        side = (np.inf, np.inf, np.inf, *(one * one for one in soft))
+        return np.array([*(one * one for one in common), *side, *side])
 
 
 def dtype_fields() -> list[tuple]:
@@ -151,7 +186,10 @@ def residual_variance(b: Record) -> float:
 
 @compiled
 def update(b: Record, y: float, variance: float) -> float:
-    """Take y = regressors' theta + residual, N, whose noise is noise_gain' z of this variance; returns residual x innovation, N^2."""
+    """Take y = regressors' theta + residual, N, the residual being noise_gain' z of this variance.
+
+    Returns residual times innovation, N^2, whose mean is the variance where model and noise are right.
+    """
     h = b.regressors
     p = b.spread
     cov = b.covariance
