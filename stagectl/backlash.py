@@ -252,10 +252,9 @@ def _filter_sides(b: Record, joint_before: float, joint: float) -> None:
     edges.filter_switched(b, 1, joint_before, joint, smooth_rate)
     # How a hysteresis turns round isn't known: samples whose filters remember a turn in contact don't count.
     b.turned = max(b.turned - 1.0, 0.0)
-    x_b = joint + b.origin_m
-    if b.looks_for_hysteresis != 0.0 and abs(smooth_rate) < _TURN_M_PER_S:
-        if not -b.left_line_m < x_b < b.right_line_m:
-            b.turned = b.hold_cycles
+    in_gap = -b.left_line_m < joint + b.origin_m < b.right_line_m
+    if b.looks_for_hysteresis != 0.0 and abs(smooth_rate) < _TURN_M_PER_S and not in_gap:
+        b.turned = b.hold_cycles
     b.warm += 1.0
 
 
