@@ -57,7 +57,7 @@ _END = (8780.0, 50.0)  # spring and damping of the end to the base
 _SEEDS = range(101, 121)
 _FEW_SEEDS = range(101, 106)
 _NORMAL_95 = 1.96
-_SETTLED_S = 0.5
+_SETTLED_S = 1.0
 _REPEATS = 5
 
 Say = Callable[[str], None]

@@ -2,7 +2,7 @@
 
 A side at penetration p beyond its line, with hysteresis h, damping c and a knee of length delta:
 
-    F = K p +- h p + c p' + (K delta^2 / 24) pulse(p),   + when pressed, - when let go
+    F = (K +- h) p + c p' + (K +- h) delta^2 / 24 pulse(p),   + when pressed, - when let go
 
 A contact F = K p^2 / (2 delta) up to delta, K (p - delta / 2) beyond, is the line of K that begins delta / 2 behind
 the onset, and an excess of area K delta^2 / 24 around there. It passes in milliseconds and the filter remembers tens
@@ -22,8 +22,9 @@ from stagectl.regression import (
 )
 from stagectl.signals import Record
 
-_PULSE_M = 10e-6
+_PULSE_M = 5.5e-6  # as wide, in standard deviation, as what a knee of 10 um has in excess
 _KNEE_POINTS_COUNT = 32
+_KNEE_MODEL_RATIO = 0.01  # what a pulse of one width gives away of knees of 5 to 15 um
 _MODEL_M = 1e-9  # what a straight line between samples gives away at an edge
 _SURE_SDS = 5.0  # that a stiffness is above zero by before an edge is published
 
@@ -59,6 +60,7 @@ def filter_switched(b: Record, side: int, from_m: float, to_m: float, smooth_rat
     origin_m = b.origin_m + (b.right_origin_m if side == 1 else b.left_origin_m)
     stiffness = b.right_stiffness_n_per_m if side == 1 else b.left_stiffness_n_per_m
     damping = b.right_damping_n_s_per_m if side == 1 else b.left_damping_n_s_per_m
+    loss = b.right_loss_ratio if side == 1 else b.left_loss_ratio
     from_p = sign * (from_m + b.origin_m) - switch_m
     to_p = sign * (to_m + b.origin_m) - switch_m
     low, high = min(from_p, to_p), max(from_p, to_p)
@@ -78,7 +80,7 @@ def filter_switched(b: Record, side: int, from_m: float, to_m: float, smooth_rat
         elif k == 2:
             new = share * rate / VELOCITY_SCALE_M_PER_S
         elif k == 3:
-            new = sign * _pulse(low, high) * KNEE_SCALE_N_M
+            new = sign * _pulse(low, high) * KNEE_SCALE_N_M * (1.0 + loss if sign * smooth_rate > 0.0 else 1.0 - loss)
         else:
             new = (mean_p if smooth_rate > 0.0 else -mean_p) / POSITION_SCALE_M
         z = b.switched[side, k]
@@ -131,6 +133,7 @@ def found(b: Record, side: int, with_knee: bool) -> tuple[float, float, float, f
     area = theta[at + 3] * KNEE_SCALE_N_M - 0.5 * stiffness * off_m * off_m
     area_sd = np.sqrt(ratio * c[at + 3, at + 3]) * KNEE_SCALE_N_M
     knee_m, knee_sd_m = _knee(area, area_sd, stiffness)
+    knee_sd_m += _KNEE_MODEL_RATIO * knee_m
     sd_m = np.sqrt(sd_m * sd_m + 0.25 * knee_sd_m * knee_sd_m)
     return line_m - 0.5 * knee_m, sd_m, stiffness, stiffness_sd, line_m, knee_m
 
@@ -145,7 +148,9 @@ def publish(b: Record, side: int, with_knee: bool, largest_sd_m: float) -> None:
         b.right_m, b.right_sd_m, b.right_line_m, b.right_knee_m = edge_m, sd_m, line_m, knee_m
         b.right_stiffness_n_per_m, b.right_stiffness_sd_n_per_m = stiffness, stiffness_sd
         b.right_damping_n_s_per_m = b.theta[RIGHT + 2] / VELOCITY_SCALE_M_PER_S
+        b.right_loss_ratio = b.theta[RIGHT + 4] / b.theta[RIGHT]
     else:
         b.left_m, b.left_sd_m, b.left_line_m, b.left_knee_m = edge_m, sd_m, line_m, knee_m
         b.left_stiffness_n_per_m, b.left_stiffness_sd_n_per_m = stiffness, stiffness_sd
         b.left_damping_n_s_per_m = b.theta[LEFT + 2] / VELOCITY_SCALE_M_PER_S
+        b.left_loss_ratio = b.theta[LEFT + 4] / b.theta[LEFT]

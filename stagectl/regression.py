@@ -74,6 +74,7 @@ def dtype_fields() -> list[tuple]:
         ("position_variance", "f8", (4, 4)),  # of a chain under white noise of 1 m
         ("force_variance", "f8", (3, 3)),
         ("first_variance", "f8", (COUNT,)),
+        ("common_noise", "f8", (COMMON_COUNT,)),  # E[h r] of the common regressors
         ("gain", "f8", (COUNT,)),
         ("work", "f8", (COUNT,)),
         ("noise_work", "f8", (NOISE_COUNT,)),
@@ -231,6 +232,12 @@ def update(b: Record, y: float, variance: float) -> float:
             value = cov[i, j] + k[i] * w[j] + w[i] * k[j] + s * k[i] * k[j]
             cov[i, j] = value
             cov[j, i] = value
+    # What regressor and residual share of the noise pulls theta: its mean is taken out.
+    for i in range(COUNT):
+        t = 0.0
+        for j in range(COMMON_COUNT):
+            t += p[i, j] * b.common_noise[j]
+        theta[i] -= t / _WEIGHT_N2
     for j in range(NOISE_COUNT):
         t = b.noise_work[j]
         for i in range(COUNT):
