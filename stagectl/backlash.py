@@ -117,6 +117,7 @@ _BOTH = -1
 _MOVED_M = 0.3e-6  # of a line off its switch, beyond which the area of a knee is no longer what the pulse has
 _SEEN_SAMPLES = 300.0  # of each side, before a line is taken to be in its place
 _TURN_M_PER_S = 3e-4  # below it a hysteresis may be turning round
+_PLACED_M = 3e-6  # of both edges, below which regressors can be switched there
 _SURE_M = 0.1e-6  # of an edge, below which a fresh start replaces what the first touches said
 _LESS_SURE_RATIO = 1.5
 _SURE_SDS = 5.0  # that a force is beyond what the doubts explain by
@@ -228,9 +229,11 @@ def _take(b: Record, y: float, side: int, q: Record, right_share: float, left_sh
     # Noise that regressors and residual share: the mass would come out 0.02 % low at 100 nm. Of a side it is nothing.
     v = b.noise_work
     n = b.common_noise
+    joint = v[7] - v[3]
+    joint_rate = w * (v[6] - v[2] - joint)
     n[0] = -w * w * (v[1] - 2.0 * v[2] + v[3])
-    n[1] = v[7] - v[3]
-    n[2] = w * (v[6] - v[2] - v[7] + v[3])
+    n[1] = joint
+    n[2] = joint_rate
     n[3] = -v[3]
     n[4] = -w * (v[2] - v[3])
     square = regression.update(b, y, variance)
@@ -241,8 +244,8 @@ def _take(b: Record, y: float, side: int, q: Record, right_share: float, left_sh
     if side == _BOTH:
         with_knee = b.looks_for_knee != 0.0  # what was published without one may be half a knee off, however sure
         least_m = b.margin_m if with_knee else _SURE_M
-        edges.publish(b, 0, with_knee, max(least_m, _LESS_SURE_RATIO * b.left_sd_m))
-        edges.publish(b, 1, with_knee, max(least_m, _LESS_SURE_RATIO * b.right_sd_m))
+        edges.publish(b, 0, with_knee, min(max(least_m, _LESS_SURE_RATIO * b.left_sd_m), b.margin_m))
+        edges.publish(b, 1, with_knee, min(max(least_m, _LESS_SURE_RATIO * b.right_sd_m), b.margin_m))
     elif side != _FREE:
         edges.publish(b, side, False, np.inf)
 
@@ -405,7 +408,7 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
             regression.drift(b, RIGHT + 1, walk * b.right_stiffness_n_per_m)
         if b.left_sd_m < np.inf:
             regression.drift(b, LEFT + 1, walk * b.left_stiffness_n_per_m)
-    if b.right_sd_m < b.margin_m and b.left_sd_m < b.margin_m:
+    if b.began != 0.0 or (b.right_sd_m < _PLACED_M and b.left_sd_m < _PLACED_M):
         _filter_sides(b, joint_before, joint)
     elif b.warm > 0.0:
         b.switched[:, :, :] = 0.0

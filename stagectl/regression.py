@@ -74,6 +74,8 @@ def dtype_fields() -> list[tuple]:
         ("position_variance", "f8", (4, 4)),  # of a chain under white noise of 1 m
         ("force_variance", "f8", (3, 3)),
         ("first_variance", "f8", (COUNT,)),
+        ("sought", "i8", (COUNT,)),  # elements of theta that are looked for, `sought_count` of them
+        ("sought_count", "i8"),
         ("common_noise", "f8", (COMMON_COUNT,)),  # E[h r] of the common regressors
         ("gain", "f8", (COUNT,)),
         ("work", "f8", (COUNT,)),
@@ -87,6 +89,9 @@ def prepare(b: np.ndarray, variances: np.ndarray) -> None:
     """Start from theta = 0 with these variances of its elements, shape (COUNT,); infinite = nothing known."""
     b["theta"] = 0.0
     b["shared"] = 0.0
+    sought = np.flatnonzero(variances)
+    b["sought"][0, : sought.size] = sought
+    b["sought_count"] = sought.size
     b["first_variance"] = np.minimum(variances, _NOTHING_KNOWN)
     b["spread"][0] = np.diag(np.where(np.isinf(variances), _NOTHING_KNOWN, variances))
     b["covariance"][0] = b["spread"][0]
@@ -146,7 +151,8 @@ def carry_noise(b: Record) -> None:
     n = b.shared
     d0, d1, d2 = b.decay_0, b.decay_1, b.decay_2
     o1, o2, o3 = b.old_1, b.old_2, b.old_3
-    for i in range(COUNT):
+    for a in range(b.sought_count):
+        i = b.sought[a]
         for at in (0, 4):
             before, z1, z2, z3 = n[i, at], n[i, at + 1], n[i, at + 2], n[i, at + 3]
             n[i, at] = 0.0
@@ -198,11 +204,15 @@ def update(b: Record, y: float, variance: float) -> float:
     theta = b.theta
     k = b.gain
     w = b.work
+    sought = b.sought
+    count = b.sought_count
     predicted = 0.0
     scale = _WEIGHT_N2
-    for i in range(COUNT):
+    for a in range(count):
+        i = sought[a]
         s = 0.0
-        for j in range(COUNT):
+        for o in range(count):
+            j = sought[o]
             s += p[i, j] * h[j]
         k[i] = s
         scale += h[i] * s
@@ -210,38 +220,46 @@ def update(b: Record, y: float, variance: float) -> float:
     innovation = y - predicted
     # C <- Phi C Phi' + Phi N c k' + k c' N' Phi' + k (c' Z c) k', Phi = I - k h', as C + k g' + g k' + s k k'
     s = variance
-    for i in range(COUNT):
+    for a in range(count):
+        i = sought[a]
         t = 0.0
-        for j in range(COUNT):
+        for o in range(count):
+            j = sought[o]
             t += cov[i, j] * h[j]
         u = 0.0
         for j in range(NOISE_COUNT):
             u += n[i, j] * b.noise_gain[j]
         s += h[i] * (t - 2.0 * u)
         w[i] = u - t
-    for i in range(COUNT):
-        for j in range(i, COUNT):
+    for a in range(count):
+        i = sought[a]
+        for o in range(a, count):
+            j = sought[o]
             value = p[i, j] - k[i] * k[j] / scale
             p[i, j] = value
             p[j, i] = value
-    for i in range(COUNT):
+    for a in range(count):
+        i = sought[a]
         k[i] /= scale
         theta[i] += k[i] * innovation
-    for i in range(COUNT):
-        for j in range(i, COUNT):
+    for a in range(count):
+        i = sought[a]
+        for o in range(a, count):
+            j = sought[o]
             value = cov[i, j] + k[i] * w[j] + w[i] * k[j] + s * k[i] * k[j]
             cov[i, j] = value
             cov[j, i] = value
     # What regressor and residual share of the noise pulls theta: its mean is taken out.
-    for i in range(COUNT):
+    for a in range(count):
+        i = sought[a]
         t = 0.0
         for j in range(COMMON_COUNT):
             t += p[i, j] * b.common_noise[j]
         theta[i] -= t / _WEIGHT_N2
     for j in range(NOISE_COUNT):
         t = b.noise_work[j]
-        for i in range(COUNT):
-            t -= h[i] * n[i, j]
-        for i in range(COUNT):
-            n[i, j] += k[i] * t
+        for a in range(count):
+            t -= h[sought[a]] * n[sought[a], j]
+        for a in range(count):
+            n[sought[a], j] += k[sought[a]] * t
     return innovation * innovation * _WEIGHT_N2 / scale
