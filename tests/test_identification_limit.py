@@ -6,7 +6,6 @@ import pytest
 from bench import identification_limit as limit
 from bench.joint_truth import Joint, Rig, motion
 from stagectl.paper import gated
-from stagectl.regression import Doubts
 
 DAMPED = Joint(damping_n_s_per_m=100.0)
 SEEDS = range(201, 204)
@@ -19,13 +18,8 @@ def damped():
 
 def pulls(one: gated.Gated, joint: Joint) -> np.ndarray:
     """Errors of edges and stiffnesses over their standard deviations."""
-    errors = (
-        *(one.last.left_m - joint.left_m, one.last.right_m - joint.right_m),
-        one.last.left_stiffness_n_per_m - joint.left_n_per_m,
-        one.last.right_stiffness_n_per_m - joint.right_n_per_m,
-    )
     sds = (one.sd.left_m, one.sd.right_m, one.sd.left_stiffness_n_per_m, one.sd.right_stiffness_n_per_m)
-    return np.array(errors) / np.array(sds)
+    return np.array(limit.errors(one, joint)) / np.array(sds)
 
 
 def width_share(one: gated.Gated, joint: Joint) -> float:
@@ -42,7 +36,7 @@ def test_intervals_are_neither_boasting_nor_useless(damped):
 @pytest.mark.parametrize("off", [-0.01, 0.01])
 def test_a_wrong_mass_is_named_and_costs_nothing(damped, off):
     for seed in SEEDS:
-        one = limit.seen(damped, 100e-9, seed, mass_error_ratio=off, doubts=Doubts(mass_kg=0.4))
+        one = limit.seen(damped, 100e-9, seed, mass_error_ratio=off, doubts=limit.MASS)
         assert abs(width_share(one, DAMPED)) < 0.2e-2
         assert abs(one.last.right_m - one.last.left_m - DAMPED.right_m + DAMPED.left_m) < 0.2e-6  # twice the centre
         assert one.last.left_stiffness_n_per_m == pytest.approx(DAMPED.left_n_per_m, rel=0.01)
@@ -54,7 +48,7 @@ def test_a_wrong_mass_is_named_and_costs_nothing(damped, off):
 
 def test_a_wrong_mass_that_is_believed_exact_is_not_covered(damped):
     """What the calibration buys: without it the width is ten times as far off, and no interval says so."""
-    calibrated = limit.seen(damped, 1e-9, 201, mass_error_ratio=0.01, doubts=Doubts(mass_kg=0.4))
+    calibrated = limit.seen(damped, 1e-9, 201, mass_error_ratio=0.01, doubts=limit.MASS)
     believed = limit.seen(damped, 1e-9, 201, mass_error_ratio=0.01)
     assert abs(width_share(believed, DAMPED)) > 10.0 * abs(width_share(calibrated, DAMPED))
 
@@ -64,7 +58,7 @@ def test_a_wrong_mass_that_is_believed_exact_is_not_covered(damped):
 def test_a_side_that_is_never_touched_has_no_number(touched, other, sign, off):
     moved = motion(DAMPED, Rig(amplitude_n=3.0, offset_n=4.0 * sign), 10.0)
     assert np.all(sign * moved.contact_n >= 0.0)
-    one = limit.seen(moved, 100e-9, 201, mass_error_ratio=off, doubts=Doubts(mass_kg=0.4))
+    one = limit.seen(moved, 100e-9, 201, mass_error_ratio=off, doubts=limit.MASS)
     assert np.all(np.isnan(getattr(one, f"{other}_m")))
     assert np.all(np.isinf(getattr(one, f"{other}_sd_m")))
     assert getattr(one.last, f"{touched}_m") == pytest.approx(getattr(DAMPED, f"{touched}_m"), abs=0.5e-6)
