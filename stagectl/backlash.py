@@ -69,6 +69,8 @@ BACKLASH = np.dtype(
         ("right_seen", "f8"),
         ("starting", "f8"),  # cycles until the filters have forgotten where they were switched before
         ("turned", "f8"),  # cycles until a turn in contact is forgotten
+        ("left_long", "f8"),  # 1 where no hold counts but a longer one
+        ("right_long", "f8"),
         ("began", "f8"),  # 1 once the sides were started with every sample
         ("warm", "f8"),  # cycles that both edges have been known for
         ("started", "f8"),
@@ -80,6 +82,7 @@ BACKLASH = np.dtype(
         ("side", "f8"),
         ("held", "f8"),
         ("held_from_m", "f8"),  # x_b where the force of this hold was first seen
+        ("held_peak_n", "f8"),
         ("unsettled", "f8"),  # cycles until the filters have forgotten how they were started
         ("motor_force_n", "f8"),  # at the last sample, through the current loop
         ("left_stiffness_n_per_m", "f8"),
@@ -120,6 +123,8 @@ _TURN_M_PER_S = 3e-4  # below it a hysteresis may be turning round
 _PLACED_M = 3e-6  # of both edges, below which regressors can be switched there
 _SURE_M = 0.1e-6  # of an edge, below which a fresh start replaces what the first touches said
 _LESS_SURE_RATIO = 1.5
+_MISFIT_RATIO = 3.0  # of mean square residual to what noise explains
+_LEAVING_RATIO = 0.4  # of a hold's peak, below which the joint may have let go
 _SURE_SDS = 5.0  # that a force is beyond what the doubts explain by
 _RATIO_SHARE = 5e-4
 
@@ -251,6 +256,12 @@ def _take(b: Record, y: float, side: int, q: Record, right_share: float, left_sh
 
 
 @compiled
+def _smooth_rate(b: Record) -> float:
+    """Return x_b', m/s, extrapolated: no lag behind a steady acceleration."""
+    return b.corner_rad_per_s * (2.0 * (b.joint_in - b.joint_1) - (b.joint_1 - b.joint_2))
+
+
+@compiled
 def _filter_sides(b: Record, joint_before: float, joint: float) -> None:
     """Advance the switched regressors; both edges are known."""
     # A knee is found from samples that were all switched at one place, hardly off the line's.
@@ -262,8 +273,7 @@ def _filter_sides(b: Record, joint_before: float, joint: float) -> None:
         if moved and b.looks_for_knee != 0.0:
             b.left_seen = b.right_seen = 0.0
             b.starting = b.settle_cycles
-    # Extrapolated: no lag behind a steady acceleration
-    smooth_rate = b.corner_rad_per_s * (2.0 * (joint - b.joint_1) - (b.joint_1 - b.joint_2))
+    smooth_rate = _smooth_rate(b)
     edges.filter_switched(b, 0, joint_before, joint, smooth_rate)
     edges.filter_switched(b, 1, joint_before, joint, smooth_rate)
     # How a hysteresis turns round isn't known: samples whose filters remember a turn in contact don't count.
@@ -285,7 +295,9 @@ def _learn_everywhere(b: Record, y: float, q: Record) -> None:
     if b.starting > 0.0:
         b.starting -= 1.0
         if b.starting == 0.0:
-            regression.start_sides_again(b)
+            regression.start_side_again(b, LEFT)
+            regression.start_side_again(b, RIGHT)
+            regression.forget_noise(b)
             b.residual_samples = b.residual_ratio = 0.0
             b.left_seen = b.right_seen = 0.0
         return
@@ -314,18 +326,25 @@ def _pressed_side(b: Record, x_b: float, contact_n: float, doubt_n: float, q: Re
         b.greatest_force_n = max(b.greatest_force_n, abs(contact_n))
     right_known = b.right_sd_m < b.margin_m
     left_known = b.left_sd_m < b.margin_m
+    # A damped joint lets go while it still overlaps, and the filtered force lags: what pushes now is foretold.
+    rate = _smooth_rate(b)
     if right_known and x_b > b.right_m + b.margin_m and contact_n > least_n:
-        return 1.0
+        now_n = b.right_stiffness_n_per_m * (x_b - b.right_m) + b.right_damping_n_s_per_m * rate
+        return 1.0 if now_n > least_n else 0.0
     if left_known and x_b < -b.left_m - b.margin_m and contact_n < -least_n:
-        return -1.0
+        now_n = b.left_stiffness_n_per_m * (x_b + b.left_m) + b.left_damping_n_s_per_m * rate
+        return -1.0 if now_n < -least_n else 0.0
     if abs(contact_n) > max(b.force_share_ratio * b.greatest_force_n, least_n):
         side = 1.0 if contact_n > 0.0 else -1.0
         if (side > 0.0 and right_known) or (side < 0.0 and left_known):
             return 0.0  # an edge that is known is gated by geometry alone
         if side != b.side:
             b.held_from_m = x_b
-        elif side * (x_b - b.held_from_m) < 0.0:
-            return 0.0  # on its way out: the filtered force lags behind
+            b.held_peak_n = 0.0
+        b.held_peak_n = max(b.held_peak_n, abs(contact_n))
+        # On its way out the filtered force lags behind, and a damped joint lets go deep inside.
+        if side * (x_b - b.held_from_m) < 0.0 or abs(contact_n) < _LEAVING_RATIO * b.held_peak_n:
+            return 0.0
         return side
     if -q.left_m + b.gap_margin_m < x_b < q.right_m - b.gap_margin_m:
         return _FREE
@@ -345,6 +364,17 @@ def _learn_where_pressed(b: Record, y: float, side: float, joint_rate: float, q:
         _take(b, y, 2, q, 0.0, 0.0)
         return
     at = RIGHT if side > 0.0 else LEFT
+    long_held = b.right_long if side > 0.0 else b.left_long
+    if long_held != 0.0 and b.held < b.settle_cycles:
+        return
+    if b.held == b.settle_cycles and long_held == 0.0 and b.residual_ratio > _MISFIT_RATIO:
+        # The first samples still held some of the onset: 0.1 N of a damper's blow of 4 N, where it strikes that hard.
+        regression.start_side_again(b, at)
+        b.residual_samples = b.residual_ratio = 0.0
+        if side > 0.0:
+            b.right_long = 1.0
+        else:
+            b.left_long = 1.0
     h[at + 1] = 1.0
     h[at + 2] = joint_rate / VELOCITY_SCALE_M_PER_S
     if side > 0.0:

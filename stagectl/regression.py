@@ -119,12 +119,12 @@ def _stationary(a: np.ndarray, g: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def start_sides_again(b: Record) -> None:
-    """Forget what is known of both sides."""
-    n = b.shared
-    n[:, :] = 0.0
-    for i in range(COMMON_COUNT, COUNT):
+def start_side_again(b: Record, at: int) -> None:
+    """Forget what is known of the side whose elements of theta begin there."""
+    for i in range(at, at + SIDE_COUNT):
         b.theta[i] = 0.0
+        for j in range(NOISE_COUNT):
+            b.shared[i, j] = 0.0
         for j in range(COUNT):
             b.spread[i, j] = b.spread[j, i] = 0.0
             b.covariance[i, j] = b.covariance[j, i] = 0.0
