@@ -120,13 +120,23 @@ _BOTH = -1
 _MOVED_M = 0.3e-6  # of a line off its switch, beyond which the area of a knee is no longer what the pulse has
 _SEEN_SAMPLES = 300.0  # of each side, before a line is taken to be in its place
 _TURN_M_PER_S = 3e-4  # below it a hysteresis may be turning round
-_PLACED_M = 3e-6  # of both edges, below which regressors can be switched there
+_PLACED_N = 0.04  # by which edges may be off, as a force, for regressors to be switched there: 3 um at 13 N/mm
+_BLOW_RATIO = 0.27  # peak of the filter's answer to a blow, in w0
 _SURE_M = 0.1e-6  # of an edge, below which a fresh start replaces what the first touches said
 _LESS_SURE_RATIO = 1.5
 _MISFIT_RATIO = 3.0  # of mean square residual to what noise explains
 _LEAVING_RATIO = 0.4  # of a hold's peak, below which the joint may have let go
 _SURE_SDS = 5.0  # that a force is beyond what the doubts explain by
 _RATIO_SHARE = 5e-4
+
+
+def believed_doubts(profile: "Profile") -> Doubts:
+    """Return what a profile leaves open: the micro's mass, or the force constant by as much, scaling every force."""
+    if profile.micro is None:
+        return Doubts()
+    micro = profile.micro
+    ratio = micro.mass_sd_kg / micro.mass_kg
+    return Doubts(micro.mass_sd_kg, ratio * micro.spring_n_per_m, ratio * micro.damping_n_s_per_m)
 
 
 def init(
@@ -169,7 +179,7 @@ def init(
         b[f"new_{k + 1}"] = total[k, 4]
         b[f"old_{k + 1}"] = total[k, 3] - total[k, 4]
     if doubts is None:
-        doubts = Doubts(mass_kg=profile.micro.mass_sd_kg) if profile.micro is not None else Doubts()
+        doubts = believed_doubts(profile)
     regression.prepare(b, doubts.variances)
     b["gap_margin_m"] = np.inf
     if doubts.force_n > 0.0 and profile.backlash is not None:  # an offset and an edge differ in the gap alone
@@ -253,6 +263,15 @@ def _take(b: Record, y: float, side: int, q: Record, right_share: float, left_sh
         edges.publish(b, 1, with_knee, min(max(least_m, _LESS_SURE_RATIO * b.right_sd_m), b.margin_m))
     elif side != _FREE:
         edges.publish(b, side, False, np.inf)
+
+
+@compiled
+def _off_n(b: Record, side: int) -> float:
+    """Return the force, N, that an edge off by its standard deviation makes: of the spring, and the damper's blow."""
+    blow_per_s = _BLOW_RATIO * b.corner_rad_per_s
+    if side == 1:
+        return b.right_sd_m * (b.right_stiffness_n_per_m + blow_per_s * b.right_damping_n_s_per_m)
+    return b.left_sd_m * (b.left_stiffness_n_per_m + blow_per_s * b.left_damping_n_s_per_m)
 
 
 @compiled
@@ -348,6 +367,10 @@ def _pressed_side(b: Record, x_b: float, contact_n: float, doubt_n: float, q: Re
         return side
     if -q.left_m + b.gap_margin_m < x_b < q.right_m - b.gap_margin_m:
         return _FREE
+    left_off_m = b.margin_m + _SURE_SDS * b.left_sd_m
+    right_off_m = b.margin_m + _SURE_SDS * b.right_sd_m
+    if -b.left_m + left_off_m < x_b < b.right_m - right_off_m:
+        return _FREE
     return 0.0
 
 
@@ -438,7 +461,7 @@ def step(b: Record, cycle: int, macro_position_m: float, end_position_m: float, 
             regression.drift(b, RIGHT + 1, walk * b.right_stiffness_n_per_m)
         if b.left_sd_m < np.inf:
             regression.drift(b, LEFT + 1, walk * b.left_stiffness_n_per_m)
-    if b.began != 0.0 or (b.right_sd_m < _PLACED_M and b.left_sd_m < _PLACED_M):
+    if b.began != 0.0 or (_off_n(b, 0) < _PLACED_N and _off_n(b, 1) < _PLACED_N):  # nan: not found yet
         _filter_sides(b, joint_before, joint)
     elif b.warm > 0.0:
         b.switched[:, :, :] = 0.0
