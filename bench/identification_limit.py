@@ -246,6 +246,8 @@ def trapezoids(seed: int, *, feed_forward: bool, count: int = 3) -> tuple[np.voi
     controller.backlash[...] = backlash.init(profile, doubts=LOOSE)
     simulation = batch.simulation(controller, machine, latch_delay_s=profile.cycle.actuation_delay_s, seed=seed)
     joint = profile.backlash
+    if joint is None:
+        raise RuntimeError("oled-printer: no joint in the profile")
     simulation.state["end_position_m"] = -0.4
     simulation.state["macro_position_m"] = -0.4 + 0.5 * (joint.right_m - joint.left_m)
     contact = [batch.run(simulation, setpoints).truth["contact_force_n"] for _ in range(count)]
@@ -256,6 +258,8 @@ def ordinary_motion(seeds: range) -> Iterator[Figure]:
     """Identify while the stage works: no sweep, force constants and masses 1 % wrong, a cable on the end."""
     profile, machine = load_profile("oled-printer"), load_machine("oled-printer")
     joint = machine.backlash
+    if joint is None or machine.micro is None or profile.micro is None:
+        raise RuntimeError("oled-printer: no joint in profile or machine")
     ratio = machine.micro.mass_kg / machine.micro.force_constant_n_per_a
     believed_n_per_a = profile.micro.rated_force_n / profile.micro.rated_current_a
     damping = next(row["damping_n_s_per_m"] for row in machine.effects if row["name"] == "contact_damping")

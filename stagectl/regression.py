@@ -62,7 +62,7 @@ class Doubts:
         return np.array([*(one * one for one in common), *side, *side])
 
 
-def dtype_fields() -> list[tuple]:
+def dtype_fields() -> list[tuple[str, str] | tuple[str, str, tuple[int, ...]]]:
     """Return the fields that the recursion keeps in the record that it is given."""
     return [
         ("theta", "f8", (COUNT,)),

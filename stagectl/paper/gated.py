@@ -19,7 +19,10 @@ EXACT = Doubts()
 
 _PROFILE = "kang-2023"
 _FILTER_S = 0.01  # nothing is controlled here: noise moves nothing
-_COLUMNS_COUNT = 8
+_COLUMNS = (
+    *("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m"),
+    *("left_sd_m", "right_sd_m", "left_knee_m", "right_knee_m"),
+)  # as `_along` fills them
 _SDS = ("left_sd_m", "right_sd_m", "left_stiffness_sd_n_per_m", "right_stiffness_sd_n_per_m")  # in Backlash's order
 
 
@@ -88,8 +91,8 @@ def along(
     b["position_noise_m"] = noise_m
     b["end_spring_n_per_m"] = spring_n_per_m
     b["end_damping_n_s_per_m"] = damping_n_s_per_m
-    out = np.empty((end_position_m.size, _COLUMNS_COUNT))
+    out = np.empty((end_position_m.size, len(_COLUMNS)))
     _along(b, belief, macro_position_m, end_position_m, out)
     sd = Backlash(*(float(b[name][0]) for name in _SDS))
-    found = b[0]
-    return Gated(*(out[:, k] for k in range(_COLUMNS_COUNT)), sd, float(found["mass_kg"]), float(found["mass_sd_kg"]))
+    columns = {name: out[:, k] for k, name in enumerate(_COLUMNS)}
+    return Gated(**columns, sd=sd, mass_kg=float(b["mass_kg"][0]), mass_sd_kg=float(b["mass_sd_kg"][0]))
