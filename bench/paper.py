@@ -6,7 +6,6 @@ control at the limit (`bench.control_limit`), and of the time that `stagectl rep
 
 import os
 import re
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -15,7 +14,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from bench import ablation, control_limit, learning, limits
+from bench import ablation, control_limit, identification_limit, learning, limits
 from bench.figure import Bar, Figure, judged
 from stagectl.paper import gated, identification_test, recursive_least_squares, rig_chapter
 from stagectl.paper.chapters import CHAPTERS, work_through
@@ -47,7 +46,6 @@ _RIG_SEEDS = range(1, 21)
 _INTERVAL_SEEDS = range(1, 201)
 _NORMAL_95 = 1.96
 _NAMES = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
-_REPEATS = 5
 _NOISE_M = 100e-9
 
 Say = Callable[[str], None]
@@ -62,7 +60,7 @@ def figures(*, full: bool, say: Say) -> Iterator[Figure]:
     yield from _table_2(samples)
     yield from _rig()
     yield from _costs(samples)
-    for part in (control_limit, limits, ablation, learning):
+    for part in (identification_limit, control_limit, limits, ablation, learning):
         yield from part.figures(full=full, say=say)
     for chapter in work_through(tuple(CHAPTERS), lambda what, _: say(what)):
         yield from figures_of(chapter)
@@ -145,11 +143,4 @@ def _costs(samples: Samples) -> Iterator[Figure]:
         recursive_least_squares.along(recursive_least_squares.init(1.0), samples.x_b_m, force_n, TABLE_2)
 
     for bar, work in ((COST, ours), (PAPER_COST, theirs)):
-        work()
-        times_s = []
-        for _ in range(_REPEATS):
-            begin_s = time.monotonic()
-            work()
-            times_s.append(time.monotonic() - begin_s)
-        median_us = 1e6 * statistics.median(times_s) / samples.t_s.size
-        yield judged(bar, median_us, reason=f"median of {_REPEATS} runs over {samples.t_s.size} samples")
+        yield identification_limit.cost(bar, work, samples.t_s.size)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from stagectl import backlash, batch, estimator, trajectory
+from stagectl import backlash, batch, edges, estimator, trajectory
 from tests.stage import exact, followed, simulated, with_values
 from tests.stage_loop import Loop
 
@@ -178,13 +178,13 @@ def test_nothing_is_known_at_first(oled_profile):
 
 def test_filters_are_exact_for_inputs_of_straight_pieces(oled_profile):
     """w0^3 / (s + w0)^3 with w0 = 100 rad/s, against scipy's own simulation of it."""
-    b = backlash.init(oled_profile)
+    b = backlash.init(oled_profile, filter_s=0.01)
     values = np.cumsum(np.random.default_rng(2).standard_normal(400)) * 1e-5
     values[0] = 0.0
     z = (0.0, 0.0, 0.0)
     ours = [0.0]
     for old, new in itertools.pairwise(values):
-        z = backlash._filtered(b[0], *z, old, new)
+        z = edges.filtered(b[0], *z, old, new)
         ours.append(z[2])
     _, expected, _ = scipy.signal.lsim(([1e6], [1.0, 300.0, 3e4, 1e6]), values, np.arange(400) * 1e-3)
     np.testing.assert_allclose(ours, expected, atol=1e-12 * np.max(np.abs(values)) + 1e-17)
@@ -225,21 +225,20 @@ def test_edges_are_in_the_runs_own_zero(oled_profile, oled_machine, origin_m):
     assert shifted["left_stiffness_n_per_m"][0] == pytest.approx(plain["left_stiffness_n_per_m"][0], rel=1e-6)
 
 
-def test_forgetting_follows_a_joint_that_wears(oled_profile, oled_machine):
-    """With a memory of 4000 contact samples, an edge that moves by 10 um is found where it is, not where it was."""
+def test_a_joint_that_wears_is_followed_where_drift_is_allowed_for(oled_profile, oled_machine):
+    """An edge that moves by 10 um between two sweeps is found where it is, not between there and where it was."""
     machine = exact(oled_machine, oled_profile)
     found = {}
-    for forgetting in (1.0, 1.0 - 1.0 / 2000.0):
+    for drift_m_per_sqrt_s in (0.0, 1e-7):
         simulation = simulated(oled_profile, machine, "dsmc")
-        simulation.controller.backlash["forgetting_ratio"] = forgetting
+        simulation.controller.backlash["edge_drift_m_per_sqrt_s"] = drift_m_per_sqrt_s
         sweep = trajectory.sweep(350e-6, 1.0, 20.0).setpoints
         batch.run(simulation, sweep)
         simulation.parameters["right_m"] += 10e-6
         batch.run(simulation, sweep)
-        found[forgetting] = float(simulation.controller.backlash["right_m"][0]) - 181.3e-6
-    worn = found[1.0 - 1.0 / 2000.0]
-    assert abs(worn) < 1.5e-6
-    assert -8e-6 < found[1.0] < -3e-6  # half of all it remembers is from before
+        found[drift_m_per_sqrt_s] = float(simulation.controller.backlash["right_m"][0]) - 181.3e-6
+    assert abs(found[1e-7]) < 0.2e-6
+    assert -8e-6 < found[0.0] < -3e-6  # half of all it remembers is from before
 
 
 def test_followed_by_hand_is_followed_by_the_tick(oled_profile, oled_machine):

@@ -100,7 +100,7 @@ def recording(duration_s: float = _DURATION_S) -> tuple[np.ndarray, Samples]:
 def identified(samples: Samples, noise_m: float, seed: int) -> Gated:
     """Run the gated estimator on one recording."""
     noise = np.random.default_rng([seed, round(1e9 * noise_m)]).standard_normal((2, samples.t_s.size)) * noise_m
-    return gated.along(samples.macro_position_m + noise[0], samples.end_position_m + noise[1], *_END)
+    return gated.along(samples.macro_position_m + noise[0], samples.end_position_m + noise[1], *_END, noise_m=noise_m)
 
 
 def worst(found: Sequence[Gated], name: str) -> float:
