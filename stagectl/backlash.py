@@ -367,10 +367,6 @@ def _pressed_side(b: Record, x_b: float, contact_n: float, doubt_n: float, q: Re
         return side
     if -q.left_m + b.gap_margin_m < x_b < q.right_m - b.gap_margin_m:
         return _FREE
-    left_off_m = b.margin_m + _SURE_SDS * b.left_sd_m
-    right_off_m = b.margin_m + _SURE_SDS * b.right_sd_m
-    if -b.left_m + left_off_m < x_b < b.right_m - right_off_m:
-        return _FREE
     return 0.0
 
 
