@@ -77,6 +77,7 @@ def test_what_is_installed_is_the_program_without_leftovers(host):
         names = {path.relative_to(ROOT) for path in (ROOT / part).rglob("*") if path.is_file()}
         installed = {path.relative_to(current) for path in (current / part).rglob("*") if path.is_file()}
         assert installed == {name for name in names if "__pycache__" not in name.parts}
+    assert not list(current.rglob("__pycache__"))
     assert os.readlink(host.root / "usr/local/bin/stagectl") == "/opt/stagectl/current/venv/bin/stagectl"
     unit = (host.root / "usr/local/lib/systemd/system/stagectl.service").read_text()
     for line in unit.splitlines():
