@@ -70,11 +70,15 @@ def test_a_second_time_changes_nothing(host):
     assert host.content() == first
 
 
-def test_what_is_installed_is_the_program_without_leftovers(host):
+def test_what_is_installed_is_the_program_without_leftovers(tmp_path, later_repository):
+    host = Host(tmp_path / "host", later_repository)
+    leftover = later_repository / "stagectl" / "__pycache__" / "tick.cpython-311.pyc"
+    leftover.parent.mkdir()
+    leftover.touch()
     host.does("install")
     current = host.root / "opt" / "stagectl" / "current"
     for part in ("stagectl", "drivers", "sim_backend", "profiles"):
-        names = {path.relative_to(ROOT) for path in (ROOT / part).rglob("*") if path.is_file()}
+        names = {path.relative_to(later_repository) for path in (later_repository / part).rglob("*") if path.is_file()}
         installed = {path.relative_to(current) for path in (current / part).rglob("*") if path.is_file()}
         assert installed == {name for name in names if "__pycache__" not in name.parts}
     assert not list(current.rglob("__pycache__"))
