@@ -67,14 +67,17 @@ def open_stage(
     Makes the run's folder: whoever leaves it empty gives it back (`run_folder.give_back`).
     """
     chosen = choose(profile, backend)
-    truth_of = machine if machine is not None else machine_path_for(profile.name)
-    progress(f"opening {chosen}", 0.0)
     if chosen == "hardware":
+        progress(f"opening {chosen}", 0.0)
         world = HardwareBackend(profile)
-    elif chosen == "rig":
-        world = RigBackend(profile, truth_of, seed=seed)
     else:
-        world = BatchBackend(load_machine(truth_of), seed=seed)
+        truth_of = machine if machine is not None else machine_path_for(profile.name)
+        progress(f"opening {chosen}", 0.0)
+        world = (
+            RigBackend(profile, truth_of, seed=seed)
+            if chosen == "rig"
+            else BatchBackend(load_machine(truth_of), seed=seed)
+        )
     facts = {
         **(manifest or {}),
         "name": name,
