@@ -197,7 +197,7 @@ uninstall() { # KEEP YES
   fi
   for entry in "${FILES[@]}"; do rm -f "$DESTDIR${entry#* }"; done
   rm -rf "$DESTDIR$PROGRAM" "$DESTDIR/usr/local/bin/stagectl" "$DESTDIR/etc/systemd/system/stagectl.service.d"
-  for folder in "${DATA_FOLDERS[@]}"; do rm -rf "${DESTDIR:?}$folder"; done
+  for folder in "${DATA_FOLDERS[@]}"; do rm -rf "$DESTDIR${folder:?}"; done
   for folder in "${SHARED_FOLDERS[@]}"; do rmdir "$DESTDIR$folder" 2>/dev/null || true; done
   if ! staged; then
     if getent passwd stagectl >/dev/null; then
