@@ -588,15 +588,12 @@ class Servo:
         hold["position_m"], hold["relative_position_m"] = kept
 
     def _follow_macro(self) -> None:
-        """Take the macro's own motion as the micro's reference while the drive brakes it.
-
-        Not its acceleration: that is an estimate which the micro's own reaction shakes, and near rest a fast law swung
-        at its limit and left the micro to its spring 0.5 mm off.
-        """
+        """Take the macro's own motion as the micro's reference while the drive brakes it."""
         hold, model = self.tracker.hold, self.tracker.active.model
         hold[...] = np.zeros(1, SETPOINT)
         hold["position_m"] = model["macro_position_m"] - gap_centre(self.tracker.active.belief[0])
         hold["velocity_m_per_s"] = model["macro_velocity_m_per_s"]
+        hold["acceleration_m_per_s2"] = model["macro_acceleration_m_per_s2"]
 
     def _slow_down(self, passed: int) -> None:
         """Bring the reference to rest at half the drive's own stopping deceleration."""
