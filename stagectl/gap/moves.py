@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +25,8 @@ _JERK_S = 0.1
 _PLACES_COUNT = 5
 _HOLD_S = 1.5
 _LEAD_S = 0.3
+_CARRIED_HZ = 0.3
+_CARRIED_M = 5e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +115,7 @@ def _all(room: Room) -> Iterator[Move]:
     yield Move("one minute of strokes", "drift and wear", _swing(room, 0.3, duration_s=60.0))
     if room.touch is not None:
         swept = trajectories.sweep(*room.touch, centre_m=middle_m, dt_s=dt_s)
-        yield Move("sweep over both edges", "the joint in contact", swept)
+        yield Move("sweep over both edges", "the joint in contact, the bodies moving apart", _carried(swept, room))
 
 
 def _swing(
@@ -127,6 +129,20 @@ def _swing(
     amplitude_m = largest_m if amplitude_m is None else min(amplitude_m, largest_m)
     ramp_s = min(max(1.0 / frequency_hz, 1.0), 0.25 * duration_s)
     return trajectories.sine(amplitude_m, omega, duration_s, room.middle_m, room.period_s, ramp_s)
+
+
+def _carried(swept: Trajectory, room: Room) -> Trajectory:
+    """Let the macro carry a sweep to and fro: where it stands, its friction takes what the micro's drive pushes back.
+
+    Measured on the simulated printer, whose decoupling keeps the macro within 0.1 um: power to tell the reaction from
+    the macro's mass 0.19 standing, 1.0 carried.
+    """
+    way = _swing(room, _CARRIED_HZ, _CARRIED_M, swept.duration_s).setpoints
+    rows = swept.setpoints.copy()
+    rows["position_m"] += way["position_m"] - room.middle_m
+    for name in ("velocity_m_per_s", "acceleration_m_per_s2", "jerk_m_per_s3"):
+        rows[name] += way[name]
+    return replace(swept, name="carried sweep", setpoints=rows)
 
 
 def _stroke(room: Room, speed_m_per_s: float) -> Trajectory:
