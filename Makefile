@@ -28,8 +28,10 @@ setup: .venv/.installed
 demo: setup
 	$(BIN)/stagectl demo
 
+# What keeps real time has the machine to itself; the rest shares its cores.
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -m 'not real_time' --numprocesses auto --dist loadfile
+	$(BIN)/python -m pytest -m real_time
 
 check: setup
 	$(BIN)/ruff format --check .

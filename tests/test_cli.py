@@ -36,6 +36,8 @@ from stagectl.supervisor import Supervisor
 from stagectl.trajectory import trapezoid
 from tests.toml_text import changed
 
+pytestmark = pytest.mark.real_time
+
 COMMANDS = [
     [],
     ["demo"],

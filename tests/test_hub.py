@@ -9,6 +9,8 @@ import pytest
 from sim_backend.hub import Hub
 from stagectl.errors import LinkError
 
+pytestmark = pytest.mark.real_time
+
 
 class _Client:
     """A bare client: it knows the packets from the protocol's text, not from our classes."""

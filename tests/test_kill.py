@@ -27,6 +27,8 @@ from stagectl.signals import Stop
 from tests import stage_child
 from tests.stage_child import SPEED_M_PER_S
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE_S = 120.0  # a cold compile cache on a host that is busy with other things
 REST_M_PER_S = 1e-3

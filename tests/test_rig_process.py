@@ -17,6 +17,8 @@ import pytest
 
 from sim_backend.machine import load_machine
 
+pytestmark = pytest.mark.real_time
+
 START_LIMIT_S = 120.0  # compiles on the first run of these sources
 
 

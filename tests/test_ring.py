@@ -18,6 +18,8 @@ from stagectl.row import FRAMES, ROW, absent_value, layout_hash, new_rows
 from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT
 from tests.small_disk import small_disk
 
+pytestmark = pytest.mark.real_time
+
 SMALL = np.dtype([("number", "i8"), ("copies", "i8", (63,))])
 LARGE_REQUEST = np.dtype([("copies", "i8", (4000,))])
 REQUEST = np.dtype([("target_m", "f8"), ("copies", "i8", (200,))])

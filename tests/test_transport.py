@@ -11,6 +11,8 @@ from drivers.transport import CHUNK_LIMIT_BYTES, RealtimeTransport
 from drivers.wire import Inbox
 from sim_backend.hub import Hub
 
+pytestmark = pytest.mark.real_time
+
 TPDO, HEARTBEAT, BUS_OFF = 0x181, 0x701, ERROR_FLAG | 0x40
 MS = 1_000_000
 

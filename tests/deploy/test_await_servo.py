@@ -3,6 +3,10 @@
 import subprocess
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.real_time
+
 SCRIPT = Path(__file__).resolve().parents[2] / "deploy" / "await_servo.sh"
 
 

@@ -12,6 +12,8 @@ import pytest
 from stagectl import cli
 from stagectl.commands.jog_keys import FIRST_HOLD_S, NEXT_HOLD_S, Hand
 
+pytestmark = pytest.mark.real_time
+
 RIGHT, LEFT, UP = b"\x1b[C", b"\x1b[D", b"\x1b[A"
 
 

@@ -19,7 +19,10 @@ from stagectl.service.access import read_tokens
 from tests.service.daemon import REST_M_PER_S, Daemon
 
 # httpcore leaves the socket of a Unix connection that is refused (of a killed service) to the garbage collector.
-pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
 
 
 def move_away(client: Client) -> None:

@@ -10,6 +10,8 @@ from stagectl.record import read_run
 from tests.service.daemon import servo_pid
 from tests.service.test_daemon import move_away
 
+pytestmark = pytest.mark.real_time
+
 
 def test_a_killed_servo_is_a_fault_that_is_recovered_from(idle):
     client = idle.client

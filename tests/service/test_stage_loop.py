@@ -18,6 +18,8 @@ from stagectl.service.stage_loop import Settings, StageLoop
 from stagectl.signals import Stop
 from tests.toml_text import changed
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE_S = 60.0
 
 
