@@ -9,11 +9,12 @@ from sim_backend.machine import Machine
 from stagectl import trajectory
 from stagectl.backend import BatchBackend
 from stagectl.errors import RequestError
+from stagectl.outcome import Outcome
 from stagectl.profile import Profile
 from stagectl.record import Run, read_run
 from stagectl.scoring import Scored, score
 from stagectl.signals import SETPOINT
-from stagectl.supervisor import Outcome, Supervisor
+from stagectl.supervisor import Supervisor
 
 SETTLED_S = 0.3
 """Rest after a motion before it counts as a hold."""

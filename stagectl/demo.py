@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from stagectl import trajectory as trajectories
+from stagectl.outcome import Outcome
 from stagectl.profile import Profile
 from stagectl.signals import Stop
-from stagectl.supervisor import Outcome, Supervisor
+from stagectl.supervisor import Supervisor
 
 LAWS = ("pid", "dsmc")
 """The rival first: figures draw ours on top."""

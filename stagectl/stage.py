@@ -10,7 +10,8 @@ from stagectl.backend import BatchBackend, HardwareBackend, RigBackend
 from stagectl.errors import LinkError, RequestError
 from stagectl.profile import Profile
 from stagectl.run_folder import reserve
-from stagectl.supervisor import Progress, Supervisor
+from stagectl.session import Progress
+from stagectl.supervisor import Supervisor
 
 BACKENDS = ("auto", "hardware", "rig", "batch")
 

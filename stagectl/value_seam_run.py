@@ -15,6 +15,7 @@ from sim_backend.machine import Machine
 from stagectl import backlash, batch, tick
 from stagectl.errors import RequestError
 from stagectl.laws.reference import gap_centre
+from stagectl.outcome import Outcome
 from stagectl.profile import Profile
 from stagectl.record import Recorder
 from stagectl.requests import Phase
@@ -22,7 +23,6 @@ from stagectl.row import new_rows
 from stagectl.run_scores import SWEEP_NAME, VALUE_SEAM, write_truth
 from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT, STOP_TEXT, Stop, stop_sentence
 from stagectl.stop_text import stop_detail
-from stagectl.supervisor import Outcome
 from stagectl.touch_sweep import (
     IDENTIFY_HZ,
     IDENTIFY_SHARE,

@@ -10,10 +10,11 @@ import numpy as np
 from sim_backend.faults import Fault
 from stagectl import trajectory as trajectories
 from stagectl.backend import BatchBackend
+from stagectl.outcome import Outcome
 from stagectl.record import Run, read_run
 from stagectl.replay import replay_run
 from stagectl.signals import Stop
-from stagectl.supervisor import Outcome, Supervisor
+from stagectl.supervisor import Supervisor
 
 STROKE_M = 0.08
 SPEED_M_PER_S = 0.2

@@ -14,13 +14,14 @@ from drivers.wire import Inbox
 from sim_backend.faults import Fault
 from stagectl.backend import BatchBackend
 from stagectl.errors import DriveError, LinkError, RecordError, RequestError
+from stagectl.outcome import BacklashEstimate
 from stagectl.profile import Identity
 from stagectl.record import read_run
 from stagectl.replay import replay
 from stagectl.requests import Phase
 from stagectl.row import SENSOR_BYTES_COUNT
 from stagectl.signals import SETPOINT, STOP_TEXT, Stop
-from stagectl.supervisor import BacklashEstimate, Supervisor
+from stagectl.supervisor import Supervisor
 from tests.small_disk import small_disk
 from tests.stage import with_values
 from tests.struck_stage import REST_M_PER_S, SEED, Stage, Strike, home_by_truth, inject, struck

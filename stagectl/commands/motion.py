@@ -11,12 +11,13 @@ from stagectl.commands.planning import Shape, kind_of, planned, target
 from stagectl.commands.scores_json import scores_json
 from stagectl.commands.tables import terminal
 from stagectl.errors import LinkError, RequestError
+from stagectl.outcome import Outcome
 from stagectl.record import read_run
 from stagectl.run_folder import reserved
 from stagectl.run_page import scores_of, tables
 from stagectl.run_scores import read_truth
 from stagectl.signals import Stop
-from stagectl.supervisor import Outcome, Supervisor
+from stagectl.supervisor import Supervisor
 
 
 def run(

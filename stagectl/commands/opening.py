@@ -8,12 +8,13 @@ from pathlib import Path
 
 from stagectl.commands.answer import Voice
 from stagectl.errors import RequestError, StagectlError
+from stagectl.outcome import Outcome
 from stagectl.profile import Profile, load_profile
 from stagectl.run_folder import give_back
 from stagectl.run_scores import VALUE_SEAM, write_truth
 from stagectl.stage import BACKENDS, open_stage
 from stagectl.suggestion import closest
-from stagectl.supervisor import Outcome, Supervisor
+from stagectl.supervisor import Supervisor
 from stagectl.tracker import LAW_NAMES
 
 

@@ -9,7 +9,7 @@ from stagectl.profile import load_profile
 from stagectl.service.daemon import serve as serve_stage
 from stagectl.service.places import default_socket
 from stagectl.service.remembered import state_folder
-from stagectl.service.stage_loop import Settings
+from stagectl.service.stage_state import Settings
 from stagectl.stage import BACKENDS
 from stagectl.suggestion import closest
 

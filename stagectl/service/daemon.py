@@ -16,7 +16,8 @@ from stagectl.service.notify import Notifier
 from stagectl.service.places import listen_tcp, listen_unix
 from stagectl.service.remembered import recall
 from stagectl.service.service_log import ServiceLog
-from stagectl.service.stage_loop import Settings, StageLoop
+from stagectl.service.stage_loop import StageLoop
+from stagectl.service.stage_state import Settings
 
 TOKENS = "tokens"
 

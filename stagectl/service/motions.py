@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from stagectl.outcome import Outcome
 from stagectl.service.states import Event
-from stagectl.supervisor import Outcome, Supervisor
+from stagectl.supervisor import Supervisor
 
 Work = Callable[[Supervisor, Any], Outcome]
 """Takes the stage and the order (body, and for a jog what is wanted now)."""

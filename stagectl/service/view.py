@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 
+from stagectl.motion import PLAN_SHARE
+from stagectl.outcome import BacklashEstimate
 from stagectl.profile import Profile
 from stagectl.service import messages
-from stagectl.supervisor import PLAN_SHARE, BacklashEstimate
 
 BANNERS = {
     "hardware": "HARDWARE: what moves here is real",

@@ -14,7 +14,8 @@ from stagectl.service.lease import LeaseRefused
 from stagectl.service.notify import Notifier
 from stagectl.service.remembered import Remembered, recall
 from stagectl.service.service_log import ServiceLog
-from stagectl.service.stage_loop import Settings, StageLoop
+from stagectl.service.stage_loop import StageLoop
+from stagectl.service.stage_state import Settings
 from stagectl.signals import Stop
 from tests.toml_text import changed
 

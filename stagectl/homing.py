@@ -1,0 +1,173 @@
+"""Zeros and joint of a stage: homing, touching both edges, identifying the backlash, believing what was found."""
+
+import math
+
+from drivers import cia402
+from stagectl import trajectory as trajectories
+from stagectl.errors import DriveError, RequestError
+from stagectl.motion import Motion
+from stagectl.outcome import BacklashEstimate, Outcome
+from stagectl.requests import Mode, Phase
+from stagectl.signals import Stop
+from stagectl.touch_sweep import (
+    IDENTIFY_HZ,
+    IDENTIFY_SHARE,
+    TOUCH_HZ,
+    TOUCH_S,
+    TOUCH_SHARE,
+    Joint,
+    contact_damping_n_s_per_m,
+    plan,
+)
+
+_INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
+_TOUCH_TRIES = 4
+_JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
+
+
+class Homing(Motion):
+    """A stage that can be homed and identified."""
+
+    def home(self) -> Outcome:
+        """Home the macro by its drive, set its laser, touch both edges, set the end's laser, centre."""
+        first_row = self.recorder.rows_count
+        stop = self._home_drive()
+        if stop is not Stop.NONE:
+            return self._outcome("home", stop, first_row)
+        self.pump(0.3)
+        status = self._await_sensor()
+        macro_scale, end_scale = self._scales()
+        macro_zero = float(status["macro_counts"]) - float(status["macro_encoder_m"]) / macro_scale
+        # At rest without power the spring stands at its middle: end = macro there, until the edges say better.
+        end_zero = float(status["end_counts"]) - float(status["macro_encoder_m"]) / end_scale
+        self._homing_id += 1
+        self._publish_update(macro_zero, end_zero)
+        estimate = None
+        if self.profile.micro is not None:
+            held = self.armed()
+            if not held.finished:
+                return held
+            outcome = self._touch()
+            estimate = outcome.backlash
+            if not outcome.finished or estimate is None:
+                return self._outcome("home", outcome.stop, first_row)
+            self.take_backlash(estimate)
+        self._event("homing", number=self._homing_id, macro_zero_counts=macro_zero, end_zero_counts=end_zero)
+        return self._outcome("home", Stop.FINISHED, first_row, estimate)
+
+    def _touch(self) -> Outcome:
+        """Sweep until both edges have been pressed; a first guess of the end's zero may be off by half the gap.
+
+        Without power the micro swings on its spring between the edges, so where it stood when the zero was taken
+        says little; the edge that was met says where the other one is.
+        """
+        for _ in range(_TOUCH_TRIES):
+            outcome = self.sweep(TOUCH_SHARE, TOUCH_HZ, TOUCH_S, "touching both edges")
+            estimate = outcome.backlash
+            if not outcome.finished or estimate is None or estimate.identifiable:
+                return outcome
+            width_m = float(self._belief["left_m"][0]) + float(self._belief["right_m"][0])
+            known = {name: float(self._belief[name][0]) for name in _JOINT}
+            if math.isfinite(estimate.right_sd_m):
+                known["right_m"], known["left_m"] = estimate.right_m, width_m - estimate.right_m
+            elif math.isfinite(estimate.left_sd_m):
+                known["left_m"], known["right_m"] = estimate.left_m, width_m - estimate.left_m
+            else:
+                break
+            sds = {name: math.inf for name in BacklashEstimate.__dataclass_fields__ if "_sd" in name}
+            self.take_backlash(BacklashEstimate(**known, **sds))
+        raise DriveError(
+            f"homing: not both edges of the joint were touched in {_TOUCH_TRIES} sweeps at {TOUCH_SHARE:.0%} of "
+            "backlash.touch_force_n; check backlash.left_m and right_m, micro.stroke_m and the voice coil"
+        )
+
+    def _scales(self) -> tuple[float, float]:
+        from drivers.wire import WireDecoder
+
+        decoder = WireDecoder(self.profile, self.mappings)
+        ratio = decoder.air_index / float(self.status()["air_index_ratio"])  # the index in use follows the air
+        return decoder.macro_m_per_count * ratio, decoder.end_m_per_count * ratio
+
+    def _homing_method(self) -> int:
+        """Return the profile's method; where the index was found before, search towards it (CiA 402, 33 and 34)."""
+        method = self.profile.macro.homing.method
+        if self._homing_id == 0 or method not in _INDEX_METHODS:
+            return method
+        return _INDEX_METHODS[1] if float(self.status()["macro_encoder_m"]) < 0.0 else _INDEX_METHODS[0]
+
+    def _home_drive(self) -> Stop:
+        """Let the macro's drive find its index."""
+        homing, node = self.profile.macro.homing, self.profile.macro.node_id
+        step_m = self.profile.macro.encoder_step_m
+        self.disarm()
+        master = self.master
+        master.write(node, cia402.MODES_OF_OPERATION, 0, cia402.MODE_HOMING)
+        master.write(node, cia402.HOMING_METHOD, 0, self._homing_method())
+        master.write(node, cia402.HOMING_SPEEDS, 1, round(homing.speed_m_per_s / step_m))
+        master.write(node, cia402.HOMING_SPEEDS, 2, round(homing.speed_m_per_s / step_m))
+        master.write(node, cia402.HOMING_ACCELERATION, 0, round(homing.acceleration_m_per_s2 / step_m))
+        if self._asked_to_stop:
+            return Stop.OPERATOR
+        self._holds_lease = True
+        self.pump()
+        self._request(mode=int(Mode.HOME_DRIVE))
+        self.pump()
+        status = self._wait(lambda s: s["phase"] == Phase.HOMED_DRIVE, homing.timeout_s, "homing the macro")
+        stop = Stop(int(status["stop"]))
+        self._request(mode=int(Mode.IDLE))
+        if stop is Stop.NONE:
+            self._wait(
+                lambda s: cia402.state_of(int(s["macro_statusword"])) is cia402.State.SWITCH_ON_DISABLED, 5.0, "resting"
+            )
+            mode = cia402.MODE_CSP if self.profile.macro.mode == "position" else cia402.MODE_CST
+            master.write(node, cia402.MODES_OF_OPERATION, 0, mode)
+        return stop
+
+    def take_backlash(self, estimate: BacklashEstimate) -> None:
+        """Believe an identified backlash; the end's zero moves so that the gap's centre is where the profile has it.
+
+        RequestError where it is none.
+        """
+        stiffnesses = (estimate.left_stiffness_n_per_m, estimate.right_stiffness_n_per_m)
+        believable = math.isfinite(estimate.centre_m) and 0.0 < estimate.width_m < math.inf
+        if not (believable and all(0.0 < stiffness < math.inf for stiffness in stiffnesses)):
+            raise RequestError(
+                f"backlash of {estimate.width_m:g} m about {estimate.centre_m:g} m with {stiffnesses} N/m: every value "
+                "must be finite, width and stiffness above 0; identify again, touching both edges"
+            )
+        status = self.status()
+        macro_scale, end_scale = self._scales()
+        before_m = float(status["end_counts"]) * end_scale - float(status["end_position_m"])
+        centre_m = 0.5 * (float(self._belief["right_m"][0]) - float(self._belief["left_m"][0]))
+        # x_b = macro - end must grow by (centre - identified centre): the end's positions shrink by it
+        end_zero = (before_m + (centre_m - estimate.centre_m)) / end_scale
+        macro_zero = float(status["macro_counts"]) - float(status["macro_position_m"]) / macro_scale
+        self._belief["left_m"] = 0.5 * estimate.width_m - centre_m
+        self._belief["right_m"] = 0.5 * estimate.width_m + centre_m
+        self._belief["left_stiffness_n_per_m"] = estimate.left_stiffness_n_per_m
+        self._belief["right_stiffness_n_per_m"] = estimate.right_stiffness_n_per_m
+        self._publish_update(macro_zero, end_zero)
+
+    def sweep(
+        self, force_share: float, usual_hz: float, duration_s: float, name: str, asked_hz: float | None = None
+    ) -> Outcome:
+        """Let the micro meet both edges, as `stagectl.touch_sweep.plan` has it for the joint that is believed now."""
+        if self.profile.micro is None or self.profile.backlash is None:
+            raise RequestError(f"{name}: this stage has no micro; there is no backlash to identify")
+        status = self.status()
+        self._centre(status)
+        joint = Joint(
+            damping_n_s_per_m=contact_damping_n_s_per_m(self.profile.effects),
+            touch_force_n=self.profile.backlash.touch_force_n,
+            **{name: float(self._belief[name][0]) for name in _JOINT},
+        )
+        planned = trajectories.sweep(
+            *plan(joint, force_share, usual_hz, duration_s, asked_hz),
+            centre_m=float(status["setpoint_position_m"]),
+            dt_s=1.0 / self.profile.cycle.rate_hz,
+        )
+        return self.follow(planned.setpoints, name)
+
+    def identify(self, frequency_hz: float | None = None, duration_s: float = 20.0) -> Outcome:
+        """Identify the backlash from a sweep over both contacts; without a frequency, one that suits the joint."""
+        return self.sweep(IDENTIFY_SHARE, IDENTIFY_HZ, duration_s, "identifying the backlash", frequency_hz)

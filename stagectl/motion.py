@@ -1,0 +1,206 @@
+"""Motion of a stage that is armed: segments that the servo follows, moves, jogs, trajectories.
+
+Every plan is checked against the profile's limits before its first cycle.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from stagectl import jogging
+from stagectl import trajectory as trajectories
+from stagectl.backend import SEGMENT_ROWS
+from stagectl.errors import RequestError, TimingError
+from stagectl.outcome import BacklashEstimate, Outcome
+from stagectl.requests import Phase
+from stagectl.session import Session
+from stagectl.signals import SETPOINT, Stop
+from stagectl.tracker import LAW_NAMES
+
+PLAN_SHARE = 0.9
+"""Of the profile's limits that planned moves use."""
+
+_JERK_TIME_S = 0.1
+
+
+class Motion(Session):
+    """A session that can move."""
+
+    _segment_number = 0
+    _segment_free = 0
+
+    def follow(self, setpoints: np.ndarray, name: str, law: str | None = None) -> Outcome:
+        """Run a segment of SETPOINT rows that begins where the stage holds; returns how it ended."""
+        if setpoints.size > SEGMENT_ROWS:
+            raise RequestError(f"{name}: {setpoints.size} setpoints, {SEGMENT_ROWS} fit; split the trajectory")
+        for field in SETPOINT.names or ():
+            odd = np.flatnonzero(~np.isfinite(setpoints[field]))
+            if odd.size:
+                value = setpoints[field][odd[0]]
+                raise RequestError(f"{name}: setpoint {odd[0]} has {field} = {value}; every value must be finite")
+        status = self.status()
+        if status["phase"] != Phase.TRACKING and status["stop"] != Stop.NONE:
+            # What came between two parts of a motion (on the way to its start, say) ends it like any other stop.
+            status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "coming to rest")
+            return self._outcome(name, Stop(int(status["stop"])), self.recorder.rows_count)
+        if status["phase"] != Phase.TRACKING:
+            raise RequestError(f"{name}: the stage is not armed; enable it first")
+        away_m = abs(float(setpoints["position_m"][0]) - float(status["setpoint_position_m"]))
+        if not away_m <= 1e-6:
+            raise RequestError(f"{name} begins {away_m:g} m from where the stage holds; move there first")
+        first_row = self.recorder.rows_count
+        number = self._begin_segment(setpoints, name, law)
+        duration_s = setpoints.size / self.profile.cycle.rate_hz
+        until_t_ns = self.link.now_t_ns() + round((duration_s * 1.5 + 5.0) * 1e9)
+        while True:
+            status = self.pump()
+            if status["phase"] != Phase.TRACKING:
+                status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "coming to rest")
+                stop = Stop(int(status["stop"]))
+                break
+            if status["segment_number"] == number and status["segment_left_rows"] <= 0:
+                stop = Stop.FINISHED
+                break
+            if self.link.now_t_ns() > until_t_ns:
+                raise TimingError(
+                    f"{name}: not done after {duration_s * 1.5 + 5.0:g} s; is the sensor's rate_hz right?"
+                )
+            self._progress(name, 1.0 - float(status["segment_left_rows"]) / setpoints.size)
+        detail = "" if stop is Stop.FINISHED else self.detail
+        self._event("segment_end", number=number, stop=stop.name, **({"detail": detail} if detail else {}))
+        return self._outcome(name, stop, first_row, self._backlash(status))
+
+    def _begin_segment(self, setpoints: np.ndarray, name: str, law: str | None = None, at_row: int = 0) -> int:
+        """Have the servo follow a segment, behind `at_row` rows of the one under way; returns its number."""
+        if self._segment_free + setpoints.size > SEGMENT_ROWS:
+            self._segment_free = 0
+        start = self._segment_free
+        self.link.segments[start : start + setpoints.size] = setpoints
+        self._segment_free += setpoints.size
+        self._segment_number += 1
+        number = self._segment_number
+        fields: dict[str, Any] = {
+            "segment_start": start,
+            "segment_rows": setpoints.size,
+            "segment_number": number,
+            "segment_at_row": at_row,
+        }
+        if law is not None:
+            fields["law_number"] = LAW_NAMES.index(law)
+        self._event("segment", number=number, segment=name, law=law, setpoints=int(setpoints.size))
+        self._request(**fields)
+        return number
+
+    def _backlash(self, status: np.void) -> BacklashEstimate | None:
+        if self.profile.micro is None:
+            return None
+        return BacklashEstimate(
+            **{name: float(status[name]) for name in BacklashEstimate.__dataclass_fields__}  # named alike
+        )
+
+    def _limits(self) -> trajectories.Limits:
+        macro = self.profile.macro
+        acceleration = PLAN_SHARE * min(macro.acceleration_limit_m_per_s2, 0.5 * macro.stop_deceleration_m_per_s2)
+        return trajectories.Limits(PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S)
+
+    def move(self, target_m: float, law: str | None = None) -> Outcome:
+        """Move the end to a position, jerk-limited; checked before the first cycle."""
+        status = self.status()
+        start_m = float(status["setpoint_position_m"])
+        self._centre(status)
+        if abs(target_m - start_m) < 1e-12:
+            return Outcome("move", Stop.FINISHED, self.recorder.rows_count, 0)
+        planned = trajectories.move(start_m, target_m, self._limits(), 1.0 / self.profile.cycle.rate_hz)
+        self._check(planned)
+        return self.follow(planned.setpoints, f"moving to {target_m * 1e3:g} mm", law)
+
+    def jog(self, wanted_m_per_s: Callable[[], float | None]) -> Outcome:
+        """Move at the velocity that is wanted now, asked for every 20 ms, until that is None; then come to rest.
+
+        Every plan under way ends at rest, at the ends of travel or within `jogging.HORIZON_S`.
+        """
+        name, first_row = "jogging", self.recorder.rows_count
+        limits, travel_m, dt_s = self._limits(), self.profile.macro.travel_m, 1.0 / self.profile.cycle.rate_hz
+        self._centre(self.status())
+        under_way, number, speed = np.zeros(0, SETPOINT), self._segment_number, 0.0
+        pending: tuple[int, jogging.Splice, float] | None = None
+        while True:
+            status = self.pump()
+            if status["phase"] != Phase.TRACKING:
+                status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "coming to rest")
+                return self._outcome(name, Stop(int(status["stop"])), first_row)
+            self._progress(name, 0.0)
+            asked = wanted_m_per_s()
+            wanted = 0.0 if asked is None else jogging.wanted_speed(asked, limits)
+            if pending is not None and status["segment_number"] == pending[0]:
+                (number, (_, under_way), speed), pending = pending, None
+            if status["segment_number"] != number:  # not begun yet
+                continue
+            left_rows = max(int(status["segment_left_rows"]), 0)
+            done_rows = under_way.size - left_rows
+            if pending is not None:
+                if done_rows <= pending[1].at_row:
+                    continue
+                pending = None  # it came too late: once more
+            if left_rows == 0:
+                if asked is None:
+                    return self._outcome(name, Stop.FINISHED, first_row)
+                start = trajectories.MotionState(float(status["setpoint_position_m"]))
+                if wanted == 0.0 or self._at_end(start.position_m, wanted):
+                    continue
+                planned = jogging.way(start, wanted, limits, travel_m, dt_s)
+                self._check(planned)
+                under_way, speed = planned.setpoints, wanted
+                number = self._begin_segment(under_way, name)
+            elif wanted != speed or self._nears_end(under_way, left_rows * dt_s, wanted):
+                spliced = jogging.splice(under_way, done_rows, wanted, limits, travel_m, dt_s)
+                if spliced is None:
+                    continue
+                self._check(spliced[1])
+                splice = spliced[0]
+                pending = self._begin_segment(splice.setpoints, name, at_row=splice.at_row), splice, wanted
+
+    def _nears_end(self, under_way: np.ndarray, left_s: float, velocity_m_per_s: float) -> bool:
+        """Tell whether a jog has used up half of its plan, and there is way left beyond it."""
+        if velocity_m_per_s == 0.0 or left_s >= 0.5 * jogging.HORIZON_S:
+            return False
+        return not self._at_end(float(under_way["position_m"][-1]), velocity_m_per_s)
+
+    def _at_end(self, position_m: float, velocity_m_per_s: float) -> bool:
+        """Tell whether there is no way left in that direction."""
+        low_m, high_m = self.profile.macro.travel_m
+        return position_m >= high_m - 1e-6 if velocity_m_per_s > 0.0 else position_m <= low_m + 1e-6
+
+    def _check(self, planned: trajectories.Trajectory) -> None:
+        macro = self.profile.macro
+        trajectories.check(
+            planned,
+            macro.travel_m,
+            macro.velocity_limit_m_per_s,
+            macro.acceleration_limit_m_per_s2,
+            stop_deceleration_m_per_s2=macro.stop_deceleration_m_per_s2,
+        )
+
+    def _centre(self, status: np.void) -> None:
+        """Bring the macro to the middle of the gap, the end at rest, by a fifth-order polynomial."""
+        relative_m = float(status["setpoint_relative_position_m"])
+        if abs(relative_m) < 1e-9:
+            return
+        duration_s = 1.0
+        count = round(duration_s * self.profile.cycle.rate_hz)
+        u = np.arange(1, count + 1) / count
+        rows = np.zeros(count, SETPOINT)
+        rows["position_m"] = status["setpoint_position_m"]
+        rows["relative_position_m"] = relative_m * (1 - (10 * u**3 - 15 * u**4 + 6 * u**5))
+        rows["relative_velocity_m_per_s"] = -relative_m * (30 * u**2 - 60 * u**3 + 30 * u**4) / duration_s
+        rows["relative_acceleration_m_per_s2"] = -relative_m * (60 * u - 180 * u**2 + 120 * u**3) / duration_s**2
+        self.follow(rows, "centring")
+
+    def run(self, planned: trajectories.Trajectory, law: str) -> Outcome:
+        """Move to a trajectory's start, then follow it under a law."""
+        self._check(planned)
+        there = self.move(float(planned.setpoints["position_m"][0]), law)
+        if not there.finished:
+            return there
+        return self.follow(planned.setpoints, f"{planned.name} under {law}", law)

@@ -1,0 +1,169 @@
+"""What state the stage is in, why, and what clients see of it; faults and what a restart remembers.
+
+Moves nothing: whoever moves the stage enters the states here.
+"""
+
+import time
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from stagectl.errors import RequestError, StagectlError
+from stagectl.profile import Profile
+from stagectl.requests import Phase
+from stagectl.service import faults, messages, recording, states
+from stagectl.service.desk import Desk, Order
+from stagectl.service.exposition import Figures
+from stagectl.service.notify import Notifier
+from stagectl.service.recording import Recording
+from stagectl.service.remembered import Memory, Remembered
+from stagectl.service.scope import Scope
+from stagectl.service.service_log import ServiceLog, now_text
+from stagectl.service.states import Event, State
+from stagectl.service.view import BANNERS, health, limits, positions
+from stagectl.signals import STOP_TEXT, Stop
+from stagectl.supervisor import Supervisor
+
+_LATENESS_EVERY_S = 0.5
+_VERSION = metadata.version("stagectl")
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the service was started with."""
+
+    profile: str
+    backend: str
+    runs_root: Path
+    state_folder: Path
+    seed: int = 0
+    machine: str | None = None
+
+
+class StageState:
+    """The state of one stage, from the service's start to its end."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        desk: Desk,
+        log: ServiceLog,
+        remembered: Remembered,
+        notifier: Notifier,
+        figures: Figures,
+    ):
+        """Hold the parts; `run` opens the stage."""
+        self.settings, self.desk, self._log, self._notifier, self._figures = settings, desk, log, notifier, figures
+        self._memory = Memory(settings.state_folder, remembered, self._say_not_kept)
+        self._recording = Recording(settings.runs_root, log)
+        self._began_s = time.monotonic()
+        self._profile_asked, self._backend_asked = settings.profile, settings.backend
+        self._profile: Profile | None = None
+        self._backend = ""  # as `auto` was resolved, once
+        self._stage: Supervisor | None = None
+        self._state, self._since = State.OFF, now_text()
+        self._fault: messages.Fault | None = None
+        self._waiting_for = "the service has just begun"
+        self._retry_at_s = 0.0
+        self._leaving = self._rereading = self._opening = self._breaking = False
+        self._scope = Scope(1000.0)
+        self._homed = False
+        self._order: Order | None = None
+        self._late: tuple[float, float] | None = None
+        self._late_at_s = 0.0
+        self._cycles_seen, self._cycles_seen_s = -1, 0.0
+
+    @property
+    def _stop_wanted(self) -> bool:
+        """Whether a client or the end of the service asks for rest."""
+        return self._leaving or self.desk.stop_asked
+
+    def _tick(self) -> None:
+        """Publish where things stand, and feed the watchdog as long as the servo's cycles, or else this loop, go on."""
+        self._heed_record_requests()
+        status = self._view()
+        self.desk.publish(status, self._state)
+        self._notifier.feed(status.health.cycles_count if self._stage is not None else time.monotonic_ns())
+
+    def _heed_record_requests(self) -> None:
+        """Begin or end a run that a client asked for; motions go on meanwhile."""
+        asked, stage = self.desk.next_record_request(), self._stage
+        if asked is None or stage is None or self._opening:
+            return
+        try:
+            if asked == "":
+                self._recording.end(recording.REQUEST, Stop.OPERATOR.name, STOP_TEXT[Stop.OPERATOR])
+            else:
+                self._recording.begin(asked, recording.REQUEST, stage.link.now_t_ns())
+        except RequestError as error:
+            self._log.say("record_lost", str(error))
+
+    def _enter(self, event: Event, text: str = "") -> None:
+        before, self._state = self._state, states.after(self._state, event)
+        if before is not self._state:
+            self._since = now_text()
+            self._log.say("state", text, state=self._state.value, before=before.value, because=event.value)
+            self._notifier.say(STATUS=f"{self._state.value}, {self._backend or 'no world'}")
+        self.desk.powered = self._state in states.POWERED
+        if before in states.POWERED and not self.desk.powered and not self._breaking:
+            self._recording.end(recording.ARM, *self._why(event, before))
+
+    def _why(self, event: Event, before: State) -> tuple[str, str]:
+        """Return how the run of a powered stage ended: the Stop's name, and the sentence."""
+        if event is Event.TRIPPED and self._fault is not None:
+            return self._fault.kind, f"{self._fault.what}: {self._fault.values}"
+        stop = Stop.FINISHED if before is State.MOVING else Stop.OPERATOR
+        return stop.name, STOP_TEXT[stop]
+
+    def _trip(self, fault: messages.Fault) -> None:
+        self._fault = fault
+        self._recording.save_last(fault.kind)
+        self._enter(Event.TRIPPED, fault.what)
+        self._log.say("fault", fault.what, **fault.model_dump(exclude={"what", "at"}))
+        self._figures.fault(fault.kind)
+
+    def _trip_by(self, stop: Stop, stage: Supervisor) -> None:
+        number = self._memory.next_fault_number()
+        self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), number))
+
+    def _fault_of(self, error: StagectlError) -> messages.Fault:
+        return faults.of_error(error, self._state, now_text(), self._memory.next_fault_number())
+
+    def _say_not_kept(self, text: str) -> None:
+        self._log.say("state_not_kept", text)
+
+    def _connected(self) -> Supervisor:
+        if self._stage is None:
+            raise RequestError(f"the stage is not connected; waiting for: {self._waiting_for or 'an acknowledgement'}")
+        return self._stage
+
+    def _view(self) -> messages.Status:
+        stage, profile = self._stage, self._profile
+        connected = stage is not None and not self._opening
+        status = stage.status() if stage is not None and connected else None
+        if time.monotonic() - self._late_at_s > _LATENESS_EVERY_S:
+            self._late, self._late_at_s = self._figures.recent_lateness_s(), time.monotonic()
+        order = self._order
+        return messages.Status(
+            state=self._state.value,
+            since=self._since,
+            banner=BANNERS.get(self._backend, "NO WORLD is open"),
+            backend=self._backend,
+            backend_description=stage.backend.description if stage is not None else "",
+            profile=profile.name if profile is not None else "",
+            profile_path=str(profile.source_path) if profile is not None else self._profile_asked,
+            waiting_for=self._waiting_for,
+            homed=self._homed and status is not None,
+            phase=Phase(int(status["phase"])).name if status is not None else "",
+            limits=limits(stage.profile if stage is not None else profile),
+            positions=positions(status),
+            health=health(status, profile.cycle.rate_hz if profile is not None else 0.0, self._late),
+            backlash=self._memory.now.backlash,
+            fault=self._fault,
+            lease=self.desk.lease_state(),
+            command=order.message() if order is not None else None,
+            recording=self._recording.message(),
+            remarks=list(stage.remarks) if stage is not None else [],
+            version=_VERSION,
+            uptime_s=time.monotonic() - self._began_s,
+        )

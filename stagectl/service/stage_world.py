@@ -1,0 +1,152 @@
+"""The world that the stage is in: waited for, opened, let go of, broken; the profile read again."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from stagectl.errors import LinkError, ProfileError, RequestError, StagectlError
+from stagectl.profile import load_profile
+from stagectl.run_folder import give_back
+from stagectl.service import states
+from stagectl.service.scope import Scope
+from stagectl.service.stage_state import StageState
+from stagectl.service.states import Event, State
+from stagectl.service.view import BANNERS
+from stagectl.service.world import missing
+from stagectl.stage import choose, open_stage
+
+_RETRY_S, _RETRY_AFTER_FAILURE_S = 2.0, 5.0
+_CONNECT_S = 240.0  # a cold compile cache on a slow host
+_CLOSE_S = 60.0  # coming to rest, rows to the disk
+ENDING = "the service was asked to end"
+"""Why the stage comes to rest at the service's end."""
+
+
+class Leaving(Exception):
+    """The service was asked to end while it was opening a world."""
+
+
+class StageWorld(StageState):
+    """A stage whose world is opened and let go of."""
+
+    def _open(self) -> None:
+        """Try to open the stage; what is missing is waited for, what is wrong is a fault."""
+        self._retry_at_s = time.monotonic() + _RETRY_S
+        try:
+            profile = self._profile = load_profile(self._profile_asked)
+            if not self._backend:
+                self._backend = choose(profile, self._backend_asked)
+                self._log.say("backend", BANNERS[self._backend], backend=self._backend, asked=self._backend_asked)
+            absent = missing(profile, self._backend, self.settings.runs_root)
+            if absent:
+                self._wait_for(absent)
+                return
+        except (ProfileError, LinkError) as error:
+            self._wait_for(str(error))
+            return
+        except RequestError as error:
+            self._trip(self._fault_of(error))
+            return
+        self._wait_for("opening the stage")
+        self._notifier.allow(_CONNECT_S)
+        folder: Path | None = None
+        self._opening = True
+        try:
+            stage = open_stage(
+                profile,
+                self._backend,
+                runs_root=self.settings.runs_root,
+                name="service",
+                seed=self.settings.seed,
+                machine=self.settings.machine,
+                progress=self._progress,
+                manifest={"banner": BANNERS[self._backend], "backend_asked": self._backend_asked},
+                lease_left_s=self.desk.lease_left_s,
+                observe=self._observe,
+                record=self._recording.factory(profile),
+            )
+            folder = stage.folder
+            self._figures.begin_servo()
+            self._scope = Scope(profile.cycle.rate_hz)
+            self.desk.scope = self._scope
+            stage.__enter__()
+            self._stage, self._homed, self._waiting_for = stage, False, ""
+            self._cycles_seen = -1
+        except Leaving:
+            return
+        except LinkError as error:
+            self._wait_for(str(error))
+            return
+        except StagectlError as error:
+            self._trip(self._fault_of(error))
+            return
+        finally:
+            self._opening = False
+            self._notifier.allow(0.0)
+            if folder is not None and self._stage is None:
+                give_back(folder)
+                self._recording.discard(folder)
+            self._retry_at_s = time.monotonic() + _RETRY_AFTER_FAILURE_S
+        self.desk.profile = stage.profile
+        self._memory.keep(profile=str(profile.source_path), profile_name=profile.name, backend=self._backend)
+        self._enter(Event.CONNECTED, stage.backend.description)
+
+    def _wait_for(self, what: str) -> None:
+        if what != self._waiting_for:
+            self._waiting_for = what
+            self._log.say("waiting", what)
+            self._notifier.say(STATUS=f"waiting: {what}")
+        self._tick()
+
+    def _close_stage(self) -> None:
+        """Let go of the world, whatever that says."""
+        stage, self._stage = self._stage, None
+        self._homed = False
+        self.desk.profile = None
+        if stage is not None:
+            self._opening = False
+            self._notifier.allow(_CLOSE_S)
+            try:
+                stage.close()
+            except StagectlError as error:
+                self._log.say("closing", str(error), kind=type(error).__name__)
+            give_back(stage.folder)
+            self._recording.forget()
+            self._notifier.allow(0.0)
+        if states.TRANSITIONS.get((self._state, Event.LET_GO)) is not None and self._state is not State.FAULT:
+            self._enter(Event.LET_GO)
+
+    def _reread(self) -> None:
+        """Read the profile again, and open the stage anew with it; a wrong one changes nothing."""
+        self._rereading = False
+        try:
+            load_profile(self._profile_asked)
+        except ProfileError as error:
+            self._log.say("profile", f"kept as it was: {error}")
+            return
+        self._log.say("profile", "read again", profile=self._profile_asked)
+        self._close_stage()
+        self._retry_at_s = 0.0
+
+    def _break(self, error: StagectlError) -> None:
+        """What broke on this side: bring the stage to rest, let go of it, and say so."""
+        self._breaking = True  # the run ends when the last rows are in it
+        self._trip(self._fault_of(error))
+        self._tick()  # said at once: closing may take as long as a servo that hangs is given
+        self._close_stage()
+        self._breaking = False
+
+    def _observe(self, rows: np.ndarray) -> None:
+        self._scope.add(rows)
+        self._figures.add(rows)
+
+    def _progress(self, what: str, share: float) -> None:
+        """Hear from the supervisor that a motion goes on; the place where a stop comes in."""
+        if self._order is not None:
+            self._order.progress(what, share)
+        if self._stop_wanted and self._stage is not None and not self._opening:
+            if states.TRANSITIONS.get((self._state, Event.STOP)) is not None:
+                self._enter(Event.STOP, ENDING if self._leaving else self.desk.stop_reason)
+            self._stage.ask_to_stop()
+        self._tick()

@@ -1,0 +1,440 @@
+"""A stage from connecting to the end: drives, servo, ring and run, power on and power off.
+
+Everything that moves is asked for through it (`stagectl.motion`, `stagectl.homing`); it plans nothing itself.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from drivers import cia402
+from drivers.arming import DriveMapping, DriveSettings, configure
+from drivers.canopen_master import Master
+from stagectl.backend import Backend, ServoLink
+from stagectl.drive_settings import drive_settings
+from stagectl.errors import DriveError, LinkError, RecordError, RequestError, StagectlError, TimingError
+from stagectl.flight_recorder import FlightRecorder
+from stagectl.heartbeats import Heartbeats
+from stagectl.outcome import BacklashEstimate, Outcome
+from stagectl.plant import PLANT_PARAMETERS
+from stagectl.profile import AxisName, Profile
+from stagectl.record import Recorder
+from stagectl.replay import describe_mapping
+from stagectl.requests import RESTING, Mode, Phase
+from stagectl.signals import STOP_TEXT, Stop, stop_sentence
+from stagectl.tracker import LAW_NAMES
+from stagectl.undisturbed import undisturbed
+
+_STEP_S = 0.02
+_SENSOR_TIMEOUT_S = 5.0
+_RESET_TIMEOUT_S = 2.0
+_FAULTS = (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE)
+
+Progress = Callable[[str, float], None]
+
+
+class Session:
+    """One stage, one holder. Use as a context; leaving it brings the stage to rest and closes the run."""
+
+    def __init__(
+        self,
+        profile: Profile,
+        backend: Backend,
+        run_folder: Path,
+        progress: Progress = lambda what, share: None,
+        manifest: dict[str, Any] | None = None,
+        *,
+        lease_left_s: Callable[[], float] = lambda: math.inf,
+        observe: Callable[[np.ndarray], None] = lambda rows: None,
+        record: Callable[[Path, dict[str, Any]], Recorder | FlightRecorder] = Recorder,
+    ):
+        """Hold the parts; nothing is touched before `connect`.
+
+        The servo's lease lasts as long as `lease_left_s` says, `trip.lease_s` at most. `observe` sees every row once.
+        """
+        self.profile, self.backend, self.folder = profile, backend, run_folder
+        self._progress = progress
+        self._manifest = dict(manifest or {})
+        self._lease_left_s, self._observe, self._record = lease_left_s, observe, record
+        self._master: Master | None = None
+        self._link: ServoLink | None = None
+        self._recorder: Recorder | FlightRecorder | None = None
+        self._counter = 0
+
+        self._update_number = 0
+        self._homing_id = 0
+        self._belief = np.zeros(1, PLANT_PARAMETERS)
+        self._holds_lease = False
+        self._watches = False
+        self._asked_to_stop = False
+        self._heartbeats = Heartbeats(profile.trip.heartbeat_s)
+        self._reason = ""  # why this side asked the servo to stop
+        self._trouble: StagectlError | None = None  # raised as soon as the stage rests
+        self.mappings: dict[str, DriveMapping] = {}
+        self.remarks: list[str] = []
+        """What the operator should know of this arming, in words."""
+
+    def __enter__(self) -> Self:
+        try:
+            self.connect()
+        except BaseException as error:
+            self._close(error)
+            raise
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        self._close(error)
+
+    # ---- parts -----------------------------------------------------------------------------------------------
+
+    @property
+    def link(self) -> ServoLink:
+        """The servo; RequestError before `connect`."""
+        if self._link is None:
+            raise RequestError("the stage is not connected; call connect() first")
+        return self._link
+
+    @property
+    def master(self) -> Master:
+        """The CANopen master; RequestError before `connect`."""
+        if self._master is None:
+            raise RequestError("the stage is not connected; call connect() first")
+        return self._master
+
+    @property
+    def recorder(self) -> Recorder | FlightRecorder:
+        """The run's recorder; RequestError before `connect`."""
+        if self._recorder is None:
+            raise RequestError("the stage is not connected; call connect() first")
+        return self._recorder
+
+    def status(self) -> np.void:
+        """Return the servo's newest state (STATUS)."""
+        return self.link.status.read()[1][0]
+
+    @property
+    def detail(self) -> str:
+        """What the last stop has to say beyond its `STOP_TEXT`; empty where nothing stopped."""
+        status = self.status()
+        if status["stop"] == Stop.NONE:
+            return ""
+        return status["text"].tobytes().rstrip(b"\0").decode(errors="replace") or self._reason
+
+    def _outcome(self, name: str, stop: Stop, first_row: int, backlash: BacklashEstimate | None = None) -> Outcome:
+        detail = "" if stop is Stop.FINISHED else self.detail
+        return Outcome(name, stop, first_row, self.recorder.rows_count - first_row, backlash, detail)
+
+    # ---- time ------------------------------------------------------------------------------------------------
+
+    def pump(self, duration_s: float = _STEP_S) -> np.void:
+        """Let time pass: renew counter and lease, drain the ring, watch the drives; returns the newest state.
+
+        What goes wrong on this side (full disk, dead receiver) first brings the stage to rest, and is raised then.
+        """
+        link = self.link
+        self._counter += 1
+        lease_s = min(self.profile.trip.lease_s, self._lease_left_s()) if self._holds_lease else 0.0
+        lease_ns = round(max(lease_s, 0.0) * 1e9)
+        link.requests.publish({"counter": self._counter, "lease_until_t_ns": link.now_t_ns() + lease_ns})
+        link.pass_time(duration_s)
+        with undisturbed():  # rows that left the ring must reach the recorder
+            try:
+                rows = link.rows.read_new()
+                self._observe(rows)
+                self.recorder.append(rows)
+            except RecordError as error:
+                self._distress(Stop.RECORD_LOST, str(error), error)
+        if self._watches:
+            self._watch_drives()
+        status = self.status()
+        if self._trouble is not None and status["phase"] in RESTING:
+            trouble, self._trouble = self._trouble, None
+            raise trouble
+        return status
+
+    def _distress(self, stop: Stop, reason: str, trouble: StagectlError | None = None) -> None:
+        """Have the servo bring the stage to rest under its law; `trouble` is raised when it has."""
+        if trouble is not None and self._trouble is None:
+            self._trouble = trouble
+        if self.status()["phase"] not in RESTING and not self._reason:
+            self._reason = reason
+            self._event("distress", stop=stop.name, text=reason)
+            self._request(mode=int(Mode.STOP), stop=int(stop))
+
+    def _watch_drives(self) -> None:
+        """Record emergencies and lost heartbeats; a lost heartbeat stops the stage."""
+        try:
+            for emergency in self.master.emergencies():
+                self._event("emergency", node_id=emergency.node_id, code=emergency.code, text=str(emergency))
+            ages_s = {axis: self.master.heartbeat_age_s(mapping.node_id) for axis, mapping in self.mappings.items()}
+        except LinkError as error:
+            self._watches = False
+            self._distress(Stop.LINK_LOST, str(error), error)
+            return
+        back, lost = self._heartbeats.look(ages_s)
+        for axis in back:
+            self._event("heartbeat_back", axis=axis, node_id=self._node_ids[axis])
+        for axis in lost:
+            self._event("heartbeat_lost", axis=axis, node_id=self._node_ids[axis], age_s=ages_s[axis])
+        if self._heartbeats.missing:
+            self._distress(Stop.HEARTBEAT_LOST, self._heartbeats.detail(self._node_ids))
+
+    @property
+    def _node_ids(self) -> dict[str, int]:
+        return {axis: mapping.node_id for axis, mapping in self.mappings.items()}
+
+    def _wait(self, done: Callable[[np.void], bool], timeout_s: float, what: str, share: float = 0.0) -> np.void:
+        """Pump until `done`; a servo that stopped by itself ends the wait too; TimingError after the timeout."""
+        until_t_ns = self.link.now_t_ns() + round(timeout_s * 1e9)
+        while True:
+            status = self.pump()
+            if done(status) or status["phase"] == Phase.STOPPED:
+                return status
+            if self.link.now_t_ns() > until_t_ns:
+                raise TimingError(f"{what}: not done after {timeout_s:g} s; phase {Phase(int(status['phase'])).name}")
+            self._progress(what, share)
+
+    def _event(self, name: str, **fields: Any) -> None:
+        try:
+            self.recorder.event(name, self.link.now_t_ns(), **fields)
+        except RecordError as error:  # the recorder holds it until there is room
+            self._distress(Stop.RECORD_LOST, str(error), error)
+
+    # ---- arming ----------------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Configure and read back the drives, start the servo, wait for sensor and process data."""
+        backend = self.backend
+        self._progress("configuring the drives", 0.0)
+        master = Master(backend.network_bus(), backend.synchronous, backend.clock_s, backend.pause)
+        self._master = master
+        settings = drive_settings(self.profile, backend.vendor_id)
+        found = configure(master, list(settings.values()), self._remark)
+        self.mappings = dict(zip(settings, found, strict=True))
+        # What a drive was capped to is what laws, guard, plans and replay go by from here on.
+        profile = self.profile = self.profile.with_force_limits(self._force_limits_n(settings))
+        manifest = {
+            **self._manifest,
+            "profile": profile.effective(),
+            "profile_path": str(profile.source_path),
+            "profile_sha256": profile.sha256,
+            "backend": self.backend.name,
+            "backend_description": self.backend.description,
+            "mappings": {axis: describe_mapping(mapping) for axis, mapping in self.mappings.items()},
+            "laws": list(LAW_NAMES),
+        }
+        self._recorder = self._record(self.folder, manifest)
+        self._link = self.backend.start_servo(profile, self.mappings, self._recorder.recovery_folder)
+        self._belief[...] = self._link.tracker_belief
+        self._recorder.save_snapshot(self._link.snapshot)
+        master.nmt(0, "start")
+        self._request(mode=int(Mode.IDLE))
+        self._event("connected", backend=self.backend.name, profile=profile.name)
+        for remark in self.backend.remarks:
+            self._remark(remark)
+        for remark in self.remarks:
+            self._event("remark", text=remark)
+        self._await_sensor()
+        self._watches = True
+
+    def _remark(self, text: str) -> None:
+        """Keep what the operator should know, and say it at once."""
+        self.remarks.append(text)
+        self._progress(text, 0.0)
+
+    def _force_limits_n(self, settings: dict[AxisName, DriveSettings]) -> dict[AxisName, float]:
+        """Return the limits of the drives that arming capped below what the profile asked for."""
+        limits_n: dict[AxisName, float] = {}
+        for axis, drive in settings.items():
+            word = self.master.read(drive.node_id, cia402.MAX_TORQUE, 0)
+            if word < drive.max_torque_word:
+                limits_n[axis] = word * self.profile.axis(axis).torque_step_n
+        return limits_n
+
+    def _await_sensor(self) -> np.void:
+        """Wait until the sensor's clock is locked; LinkError says what the interferometer lacks."""
+        try:
+            status = self._wait(lambda s: bool(s["sensor_ready"]), _SENSOR_TIMEOUT_S, "waiting for the interferometer")
+        except TimingError as error:
+            raise LinkError(self._sensor_text()) from error
+        if not status["sensor_ready"]:
+            raise LinkError(stop_sentence(Stop(int(status["stop"])), self.detail))
+        return status
+
+    def _sensor_text(self) -> str:
+        """Say what came of the interferometer in the last second instead of valid samples."""
+        sensor, rows = self.profile.interferometer, self.link.rows.read_last(round(self.profile.cycle.rate_hz))
+        bytes_count = int(rows["sensor_bytes_count"].sum())
+        if bytes_count == 0:
+            found = "nothing came; check its power and cable, and interferometer.port"
+        elif int(rows["samples_new"].sum()) == 0:
+            found = f"{bytes_count} bytes came in the last second, no valid sample; check beams, format and baud rate"
+        else:
+            found = f"samples come too seldom; check rate_hz = {sensor.rate_hz:g} and the beams"
+        return f"interferometer {sensor.port}: no steady valid samples within {_SENSOR_TIMEOUT_S:g} s: {found}"
+
+    def _request(self, **fields: Any) -> None:
+        self._counter += 1
+        self.link.requests.publish({"counter": self._counter, **fields})
+
+    def _publish_update(self, macro_zero_counts: float, end_zero_counts: float) -> None:
+        """Have the servo take zeros and belief; the event holds them for replay."""
+        self._update_number += 1
+        names = PLANT_PARAMETERS.names or ()
+        belief = {name: float(self._belief[name][0]) for name in names}
+        self._event(
+            "update",
+            number=self._update_number,
+            macro_zero_counts=macro_zero_counts,
+            end_zero_counts=end_zero_counts,
+            belief={name: repr(value) for name, value in belief.items()},
+        )
+        self._request(
+            update_number=self._update_number,
+            homing_id=self._homing_id,
+            macro_zero_counts=macro_zero_counts,
+            end_zero_counts=end_zero_counts,
+            **{f"belief_{name}": value for name, value in belief.items()},
+        )
+        number = self._update_number
+        self._wait(lambda s: s["update_number"] == number, 2.0, "taking over zeros")
+
+    def enable(self, law: str | None = None) -> Stop:
+        """Enable both drives and hold where the stage is; returns why not, NONE when it holds."""
+        if self.status()["phase"] == Phase.TRACKING:
+            return Stop.NONE
+        if self._asked_to_stop:
+            return Stop.OPERATOR
+        if self._heartbeats.missing:
+            return Stop.HEARTBEAT_LOST
+        self._holds_lease = True
+        self._reason = ""
+        self._request(
+            mode=int(Mode.TRACK), stop=int(Stop.NONE), law_number=LAW_NAMES.index(law or self.profile.control.law)
+        )
+        self.pump()
+        status = self._wait(lambda s: s["phase"] == Phase.TRACKING, 5.0, "enabling the drives")
+        return Stop(int(status["stop"]))
+
+    def armed(self, law: str | None = None) -> Outcome:
+        """Enable like `enable`; FINISHED where the stage holds, else why it doesn't."""
+        first_row = self.recorder.rows_count
+        stop = self.enable(law)
+        if stop is Stop.HEARTBEAT_LOST:  # refused: the servo did not even hear of it
+            return Outcome("enable", stop, first_row, 0, detail=self._heartbeats.detail(self._node_ids))
+        return self._outcome("enable", Stop.FINISHED if stop is Stop.NONE else stop, first_row)
+
+    def ask_to_stop(self) -> None:
+        """Have the motion under way come to rest; nothing is enabled or homed before `allow_motion`.
+
+        To be called between two steps of a motion, from `progress` say; the motion ends with OPERATOR.
+        """
+        self._asked_to_stop = True
+        if self.status()["phase"] not in RESTING:
+            self._request(mode=int(Mode.STOP), stop=int(Stop.NONE))
+
+    def allow_motion(self) -> None:
+        """Take back `ask_to_stop`; moves and enables nothing."""
+        self._asked_to_stop = False
+
+    def disarm(self) -> Stop:
+        """Bring the stage to rest under the law, then take the power away."""
+        phase = self.status()["phase"]
+        if phase in (Phase.IDLE, Phase.HOMED_DRIVE):
+            return Stop.NONE
+        self._request(mode=int(Mode.STOP), stop=int(Stop.NONE))
+        status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "stopping")
+        self._holds_lease = False
+        stop = Stop(int(status["stop"]))
+        if stop is Stop.OPERATOR:
+            self.acknowledge()
+        return stop
+
+    def acknowledge(self) -> Stop:
+        """Acknowledge why the servo stopped, reset drives in fault; enables nothing. Returns what stops it again.
+
+        DriveError where a drive stays in fault.
+        """
+        self._wait(lambda s: s["phase"] in RESTING, 20.0, "coming to rest")
+        self._reason = ""
+        self._request(mode=int(Mode.RESET), stop=int(Stop.NONE), acknowledge_number=self._counter + 1)
+        self._pump_until(lambda s: s["phase"] != Phase.STOPPED, 0.5)
+        status = self._pump_until(lambda s: not self._failed(s), _RESET_TIMEOUT_S)
+        self._request(mode=int(Mode.IDLE))
+        if status["phase"] == Phase.STOPPED:
+            return Stop(int(status["stop"]))
+        failed = self._failed(status)
+        if failed:
+            raise DriveError(
+                f"{' and '.join(failed)} still in fault {_RESET_TIMEOUT_S:g} s after the reset; clear its cause "
+                "(the events hold its emergency messages), then acknowledge again"
+            )
+        return Stop.NONE
+
+    def _pump_until(self, done: Callable[[np.void], bool], timeout_s: float) -> np.void:
+        until_t_ns = self.link.now_t_ns() + round(timeout_s * 1e9)
+        status = self.pump()
+        while not done(status) and self.link.now_t_ns() < until_t_ns:
+            status = self.pump()
+        return status
+
+    def _failed(self, status: np.void) -> list[str]:
+        """Name the drives that are in fault."""
+        named = {axis: cia402.state_of(int(status[f"{axis}_statusword"])) for axis in self.mappings}
+        return [f"{axis} (node {self.mappings[axis].node_id})" for axis, state in named.items() if state in _FAULTS]
+
+    def close(self) -> None:
+        """Rest, power off, rows to disk; lets go of everything whatever fails, and raises what failed."""
+        self._close(None)
+
+    def _close(self, under_way: BaseException | None) -> None:
+        """Close; an error that is under way already says more than what follows from it, and stands in the run."""
+        link, recorder, master = self._link, self._recorder, self._master
+        self._master = None
+        with contextlib.ExitStack() as stack:
+            stack.callback(self.backend.close)
+            if master is not None:
+                stack.callback(master.close)
+            asked = Stop.OPERATOR if isinstance(under_way, KeyboardInterrupt) else Stop.NONE
+            end: dict[str, Any] = {"stop": asked.name, "text": STOP_TEXT[asked]}
+            if isinstance(under_way, StagectlError):
+                end["error"] = f"{type(under_way).__name__}: {under_way}"
+            if recorder is not None and link is None:  # no servo, so no row that could be missing
+                stack.callback(recorder.close, end)
+            if recorder is not None and link is not None:
+                stack.callback(self._end_run, link, recorder, end)
+                self._rest(end, asked, quiet=under_way is not None)
+
+    def _rest(self, end: dict[str, Any], asked: Stop, quiet: bool) -> None:
+        """Bring the stage to rest and fill in how the run ended; `asked` where nothing else stopped it."""
+        self._watches = False
+        try:
+            detail = self.detail
+            stop = self.disarm() or asked
+            self.pump(0.1)
+            end.update(stop=stop.name, text=STOP_TEXT[stop], detail=detail)
+            status = self.status()
+            end.update({name: int(status[name]) for name in ("lost_samples", "discarded_bytes", "missed_cycles")})
+        except StagectlError as error:
+            stop = Stop(int(self.status()["stop"])) or Stop.LINK_LOST
+            end.update(stop=stop.name, text=STOP_TEXT[stop], detail=self.detail or str(error))
+            if not quiet:
+                raise
+
+    def _end_run(self, link: ServoLink, recorder: Recorder | FlightRecorder, end: dict[str, Any]) -> None:
+        """End the servo, which first stops what moves, and put its last rows on the disk."""
+        with undisturbed():
+            self._link = None
+            link.close()
+            try:
+                with contextlib.suppress(RecordError):  # held; closing says so where it still finds no room
+                    recorder.append(link.rows.read_new())
+                recorder.close(end)
+            except RecordError:
+                recorder.abandon()  # what is not on the disk stays in the ring
+                raise
+            link.forget_rows()
