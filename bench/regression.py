@@ -11,11 +11,13 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from stagectl.gap import balance, hypotheses
-from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.believed import Believed
+from stagectl.gap.effect_forces import known_forces
+from stagectl.gap.forces import Forces
 from stagectl.gap.grids import grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.log import Log
+from stagectl.gap.recording import Recording
 
 LEFT_OUT = ("scale_error",)
 """A reading that is all too large makes the whole balance too large: with it and a wrong mass a regression without
@@ -119,7 +121,7 @@ class _Rows:
 
 
 def _block(recording: Recording, base: list[Term], terms: list[Term]) -> _Rows:
-    known = balance.known_forces(recording)
+    known = known_forces(recording)
     parts, axes = [], []
     for number, axis in enumerate(recording.axes):
         known_n = known.macro_n if axis == "macro" else known.end_n

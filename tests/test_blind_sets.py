@@ -9,6 +9,7 @@ import pytest
 from bench import blind_sets
 from bench.blind_sets import Job, Searched, held_out, line, load_set, marked, seeds_of, summary_lines
 from stagectl.gap import balance
+from stagectl.gap.effect_forces import known_forces
 from stagectl.gap.innovations import Noise
 from tests.blind import draw, generate
 from tests.blind.machine import B
@@ -50,7 +51,7 @@ def left(blind, number, believed=None):
         "end": Noise(blind.believed.micro.noise_m if blind.believed.micro else 1.0, 0.05, 2 * np.pi * 2, 0.005),
     }
     balance.set_noise(recording, {axis: noise[axis] for axis in recording.axes})
-    known = balance.known_forces(recording)
+    known = known_forces(recording)
     forces = {"macro": known.macro_n, "end": known.end_n}
     return [
         float(np.mean(balance.whitened(recording, axis, forces[axis], recording.position_m(axis)) ** 2))

@@ -8,8 +8,11 @@ import pytest
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
+from stagectl.gap.effect_forces import effect_forces, known_forces
 from stagectl.gap.log import Log
 from stagectl.gap.motion import motion_of, motion_under
+from stagectl.gap.operating_point import operating_point, with_joint_changed
+from stagectl.gap.reading_errors import reading_error_m
 from stagectl.gap.settling import settled_by
 
 H, MASS_KG, NOISE_M = 1e-3, 40.0, 5e-9
@@ -56,10 +59,10 @@ def test_readings_of_a_skewed_clock_are_put_where_they_were_taken(start_s):
         _axis_log(_swing(T_S + late_s) + NOISE_M * random.standard_normal(COUNT), start_s), AXIS
     )
     skew = CATALOGUE["clock_skew"]
-    there = balance.operating_point(recording, [(skew, "macro_sensor", {"skew_ppm": 27.0})])
+    there = operating_point(recording, [(skew, "macro_sensor", {"skew_ppm": 27.0})])
     off_m = there.log.macro_position_m - _swing(T_S)
     assert np.std(off_m[400:-20]) < 1.2 * NOISE_M
-    error_m = balance.reading_error_m(recording, skew, "macro_sensor", [27.0], whole=True)[:, 0]
+    error_m = reading_error_m(recording, skew, "macro_sensor", [27.0], whole=True)[:, 0]
     moved_m = _swing(T_S + late_s) - _swing(T_S)
     assert np.max(np.abs(error_m - moved_m)[400:-20]) < 1e-4 * np.max(np.abs(moved_m)) + NOISE_M
 
@@ -87,19 +90,19 @@ def touching():
     [("soft_contact", [25e-6]), ("contact_damping", [400.0]), ("contact_hysteresis", [0.5, 1e-5])],
 )
 def test_a_contact_never_pulls_whatever_is_added_at_its_size(touching, name, parameters):
-    believed_n = balance.known_forces(touching).end_n - (
+    believed_n = known_forces(touching).end_n - (
         JOINT.spring_n_per_m * (touching.macro.position_m - touching.end.position_m)
         + JOINT.damping_n_s_per_m * (touching.macro.velocity_m_per_s - touching.end.velocity_m_per_s)
     )
-    at_size = balance.effect_forces(touching, CATALOGUE[name], "contact", parameters, whole=True)
-    first_order = balance.effect_forces(touching, CATALOGUE[name], "contact", parameters)
+    at_size = effect_forces(touching, CATALOGUE[name], "contact", parameters, whole=True)
+    first_order = effect_forces(touching, CATALOGUE[name], "contact", parameters)
     assert np.min(believed_n + first_order.end_n) < -0.01
     assert np.min(believed_n + at_size.end_n) > -1e-12
     assert np.array_equal(at_size.macro_n, -at_size.end_n)
 
 
 def test_what_the_joint_was_settled_by_is_known(touching):
-    there = balance.with_joint_changed(touching, 0.2e-6, -0.1e-6, 0.05)
+    there = with_joint_changed(touching, 0.2e-6, -0.1e-6, 0.05)
     found = settled_by(STAGE, there)
     assert found == pytest.approx({"left_m": 0.2e-6, "right_m": -0.1e-6, "contact_damping on contact": 0.05})
     assert there.believed.effects[0]["damping_n_s_per_m"] == pytest.approx(94.5)

@@ -12,9 +12,12 @@ from typing import Literal
 import numpy as np
 
 from stagectl.effects import CATALOGUE
-from stagectl.gap import balance
-from stagectl.gap.balance import Forces, Recording
+from stagectl.gap.effect_forces import effect_forces, joint_force_n, known_forces, motor_forces
+from stagectl.gap.forces import Forces, add_forces, scaled_forces
 from stagectl.gap.hypotheses import Term, parameter_terms, term_of
+from stagectl.gap.quantities import along_motion, quantities
+from stagectl.gap.reading_errors import misread
+from stagectl.gap.recording import Recording
 
 ACCELERATION_M_PER_S2 = 0.01
 """Size at which constant and position-dependent forces are judged: what so much acceleration of the body takes."""
@@ -157,7 +160,7 @@ def _late(axis: str, motors: Sequence[Term]) -> Member:
     def forces(r: Recording) -> list[Forces]:
         motor = Forces()
         for term in motors:
-            balance.add(motor, balance.scaled(term.forces(r)[0], _STEP_S, Forces()))
+            add_forces(motor, scaled_forces(term.forces(r)[0], _STEP_S, Forces()))
         total = Forces(macro_n=motor.macro_n) if axis == "macro" else Forces(end_n=motor.end_n)
         between_n = _between_n(r)
         if between_n is None:
@@ -167,9 +170,9 @@ def _late(axis: str, motors: Sequence[Term]) -> Member:
         if misread.end_n is None:
             raise KeyError("end")
         if axis == "macro":
-            balance.add(total, Forces(macro_n=joint_late_n - misread.end_n, end_n=misread.end_n))
+            add_forces(total, Forces(macro_n=joint_late_n - misread.end_n, end_n=misread.end_n))
         else:
-            balance.add(total, Forces(macro_n=misread.end_n - joint_late_n, end_n=-misread.end_n))
+            add_forces(total, Forces(macro_n=misread.end_n - joint_late_n, end_n=-misread.end_n))
         return [total]
 
     return replace(late, term=replace(late.term, forces=forces))
@@ -179,11 +182,11 @@ def _between_n(r: Recording) -> np.ndarray | None:
     """Return the force between the bodies, on the end."""
     if r.end is None or r.believed.joint is None:
         return None
-    total = Forces(end_n=balance.joint_force_n(r))
+    total = Forces(end_n=joint_force_n(r))
     for row in r.believed.effects:
         if row["acts_on"] in ("joint", "contact"):
             effect = CATALOGUE[row["name"]]
-            balance.add(total, balance.effect_forces(r, effect, row["acts_on"], [row[n] for n in effect.parameters]))
+            add_forces(total, effect_forces(r, effect, row["acts_on"], [row[n] for n in effect.parameters]))
     return total.end_n
 
 
@@ -200,11 +203,11 @@ def _constants(r: Recording) -> AliasSet:
 
     def uneven_forces(r: Recording) -> Forces:
         values = smooth | {"forward_n": 1.0, "backward_n": -1.0}
-        return balance.effect_forces(r, uneven, "macro_force", [values[name] for name in uneven.parameters])
+        return effect_forces(r, uneven, "macro_force", [values[name] for name in uneven.parameters])
 
     def amplifier(r: Recording) -> Forces:
         current_a = np.full(r.log.samples_count, 1.0 / r.force_constant_n_per_a("macro"))
-        return balance.motor_forces(r, "macro", _ones(r), current_a)
+        return motor_forces(r, "macro", _ones(r), current_a)
 
     return AliasSet(
         "offset, tilt, amplifier offset, asymmetric Coulomb friction",
@@ -273,11 +276,11 @@ def _mode(r: Recording) -> AliasSet:
 
     def ringing(r: Recording) -> Forces:
         # acceleration by what drives: the measured one's noise would ring, and look like something that was excited
-        driving_n = balance.known_forces(r).macro_n
+        driving_n = known_forces(r).macro_n
         driven = {} if driving_n is None else {"acceleration_m_per_s2": driving_n / r.mass_kg("macro")}
-        known = balance.quantities(r, "macro", "macro_force") | driven
+        known = quantities(r, "macro", "macro_force") | driven
         arguments = [known[name] for name in flexible.quantities]
-        return Forces(macro_n=balance.along_motion(flexible, arguments, [MODE[name] for name in flexible.parameters]))
+        return Forces(macro_n=along_motion(flexible, arguments, [MODE[name] for name in flexible.parameters]))
 
     mode = _of("flexible_mode", "macro_force", ringing, "share_of_shape_ratio")
     return AliasSet(
@@ -330,11 +333,11 @@ def _drift() -> AliasSet:
 
 
 def _zero(r: Recording) -> AliasSet:
-    def misread(r: Recording) -> Forces:
-        return balance.misread(r, "end", np.ones((r.log.samples_count, 1)), False)
+    def shifted(r: Recording) -> Forces:
+        return misread(r, "end", np.ones((r.log.samples_count, 1)), False)
 
     size_m = SD_COUNT * (0.0 if r.believed.joint is None else r.believed.joint.width_sd_m)
-    zero = _of("relative_zero", "end_sensor", misread, "error_m", "session")
+    zero = _of("relative_zero", "end_sensor", shifted, "error_m", "session")
     return AliasSet(
         "centre of the backlash against zero of the relative position",
         "the edges stand at c +- b / 2 of a reading x_r + z: c + z is all that contact shows, k z is a constant force",

@@ -6,14 +6,16 @@ import numpy as np
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses, seeds
-from stagectl.gap.balance import Forces, Moved, Recording
 from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.evidence import Evidence
+from stagectl.gap.forces import Forces, scaled_forces
 from stagectl.gap.grids import free_shapes, grids_for
 from stagectl.gap.hypotheses import DEVIATION_SD, Term, widest_amplitudes
 from stagectl.gap.innovations import Noise
 from stagectl.gap.noise import Explained
 from stagectl.gap.normal_equations import Group, Sums, solve
+from stagectl.gap.operating_point import Moved
+from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner, but_for_size, counts_at_size, gain_at_size, refined
 from stagectl.gap.selection import Judge
 
@@ -144,7 +146,7 @@ class Competition:
             for term, group in terms:
                 for column, forces in zip(group.columns, term.forces(recording), strict=True):
                     value = next((values[column, scope] for scope in scopes if (column, scope) in values), 0.0)
-                    total = balance.scaled(forces, value, total)
+                    total = scaled_forces(forces, value, total)
             return total
 
         return of

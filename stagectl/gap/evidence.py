@@ -13,10 +13,10 @@ import numpy as np
 
 from stagectl import effect_text
 from stagectl.gap import balance
-from stagectl.gap.balance import Recording
 from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Sums
+from stagectl.gap.recording import Recording
 
 INNOVATIONS = 0
 """Number of the column that the others are to explain."""

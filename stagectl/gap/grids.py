@@ -10,7 +10,7 @@ import numpy as np
 
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.effects.table import TABLES
-from stagectl.gap.balance import Recording
+from stagectl.gap.recording import Recording
 
 _SMOOTHINGS_M_PER_S = (1e-6, 1e-5, 1e-4, 1e-3)
 """Where velocities are judged their sign is known, and real friction is sharp: at 0.1 mm/s four times as much of a

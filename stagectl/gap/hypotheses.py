@@ -11,9 +11,11 @@ from functools import partial
 import numpy as np
 
 from stagectl.effects import CATALOGUE, Effect, Trait
-from stagectl.gap import balance
-from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.command_path import driven
+from stagectl.gap.effect_forces import effect_forces, known_forces, motor_forces
+from stagectl.gap.forces import Forces, add_forces, scaled_forces
+from stagectl.gap.quantities import quantities
+from stagectl.gap.recording import Recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,7 @@ def _inertia(axis: str, r: Recording) -> list[Forces]:
     Taken as m times the measured acceleration it would, together with the force constant, shrink every rest that
     nobody explains: a fit that collapses.
     """
-    known = balance.known_forces(r)
+    known = known_forces(r)
     share = r.belief(axis).mass_kg / r.mass_kg(axis)
     if axis == "macro":
         return [Forces(macro_n=None if known.macro_n is None else -share * known.macro_n)]
@@ -100,7 +102,7 @@ def _macro_motor(r: Recording) -> list[Forces]:
 
 
 def _micro_motor(r: Recording) -> list[Forces]:
-    return [Forces() if r.micro_command_n is None else balance.motor_forces(r, "end", r.micro_command_n, None)]
+    return [Forces() if r.micro_command_n is None else motor_forces(r, "end", r.micro_command_n, None)]
 
 
 def _spring(stiffness_n_per_m: float, r: Recording) -> list[Forces]:
@@ -121,7 +123,7 @@ def _edge(sign: float, stiffness_n_per_m: float, r: Recording) -> list[Forces]:
 
 
 def _existing(name: str, place: str, values: list[float], r: Recording) -> list[Forces]:
-    return [balance.effect_forces(r, CATALOGUE[name], place, values)]
+    return [effect_forces(r, CATALOGUE[name], place, values)]
 
 
 _WRONG_RATIO = 0.3
@@ -152,7 +154,7 @@ def _together(parts: tuple[Callable[[Recording], list[Forces]], ...], r: Recordi
     """Return the first forces of each part, added."""
     total = Forces()
     for part in parts:
-        balance.add(total, part(r)[0])
+        add_forces(total, part(r)[0])
     return [total]
 
 
@@ -187,7 +189,7 @@ def _timing(axis: str, lag_s: float, r: Recording) -> list[Forces]:
     now = driven(command_n, latch_s, loop_s, h)
     later = driven(command_n, latch_s + (0.0 if lag_s else step_s), loop_s + (step_s if lag_s else 0.0), h)
     slope, slope_at = ((after - before) / step_s for before, after in zip(now, later, strict=True))
-    return [balance.motor_forces(r, axis, slope, slope_at / belief.force_constant_n_per_a)]
+    return [motor_forces(r, axis, slope, slope_at / belief.force_constant_n_per_a)]
 
 
 def _joint(force_on_end_n: np.ndarray) -> list[Forces]:
@@ -317,8 +319,8 @@ def deviation_term(effect: Effect, place: str, parameters: dict[str, float]) -> 
 
 
 def _slope(name: str, place: str, now: list[float], later: list[float], r: Recording) -> list[Forces]:
-    here, there = (balance.effect_forces(r, CATALOGUE[name], place, values) for values in (now, later))
-    return [balance.scaled(there, 1.0 / _STEP_RATIO, balance.scaled(here, -1.0 / _STEP_RATIO, Forces()))]
+    here, there = (effect_forces(r, CATALOGUE[name], place, values) for values in (now, later))
+    return [scaled_forces(there, 1.0 / _STEP_RATIO, scaled_forces(here, -1.0 / _STEP_RATIO, Forces()))]
 
 
 _SHARE_BOUNDS = (0.0, 3.0)
@@ -326,9 +328,9 @@ _SHARE_BOUNDS = (0.0, 3.0)
 
 def _everywhere(r: Recording, effect: Effect, place: str, values: list[float], *, whole: bool = False) -> Forces:
     """Evaluate an effect at its place; one of the base on both bodies."""
-    forces = balance.effect_forces(r, effect, place, values, whole=whole)
+    forces = effect_forces(r, effect, place, values, whole=whole)
     if Trait.BASE in effect.traits and r.end is not None:
-        balance.add(forces, balance.effect_forces(r, effect, "micro_force", values))
+        add_forces(forces, effect_forces(r, effect, "micro_force", values))
     return forces
 
 
@@ -357,7 +359,7 @@ def curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
     axes = recordings[0].axes
     for axis in axes:
         for quantity in (*_CURVES, *(("relative_position_m",) if len(axes) > 1 else ())):
-            spans = [balance.quantities(r, axis, "macro_force")[quantity] for r in recordings]
+            spans = [quantities(r, axis, "macro_force")[quantity] for r in recordings]
             low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
             if not high > low:
                 continue
@@ -372,6 +374,6 @@ def curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
 
 
 def _hats(axis: str, quantity: str, knots: np.ndarray, r: Recording) -> list[Forces]:
-    value = balance.quantities(r, axis, "macro_force")[quantity]
+    value = quantities(r, axis, "macro_force")[quantity]
     hats = [np.interp(value, knots, np.eye(knots.size)[k]) for k in range(knots.size)]
     return [Forces(macro_n=hat) if axis == "macro" else Forces(end_n=hat) for hat in hats]

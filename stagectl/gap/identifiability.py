@@ -18,7 +18,6 @@ from scipy.stats import norm
 
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.alias_sets import SIGNALS, AliasSet, alias_sets
-from stagectl.gap.balance import Recording
 from stagectl.gap.believed import Believed
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.hypotheses import Term
@@ -27,6 +26,7 @@ from stagectl.gap.moves import Move
 from stagectl.gap.noise import noise_of, slow_noise
 from stagectl.gap.normal_equations import Group, Sums, active_slots, normal_of
 from stagectl.gap.planned import planned_log
+from stagectl.gap.recording import Recording
 from stagectl.gap.selection import ALIAS_GAIN
 
 _JITTER = 1e-10

@@ -17,8 +17,8 @@ from scipy.signal import butter, decimate, sosfiltfilt
 
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.errors import RequestError
-from stagectl.gap.balance import along_motion
 from stagectl.gap.log import Log
+from stagectl.gap.quantities import along_motion
 
 CORNER_HZ = 100.0
 DECIMATION = 10

@@ -8,15 +8,17 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from stagectl.gap import balance
-from stagectl.gap.balance import Recording
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Crew
+from stagectl.gap.effect_forces import known_forces
 from stagectl.gap.findings import Named
+from stagectl.gap.forces import sum_of_forces
 from stagectl.gap.innovations import Noise
 from stagectl.gap.left_over import excess, unknown_rest
 from stagectl.gap.naming import all_named
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group
+from stagectl.gap.recording import Recording
 from stagectl.gap.settling import moved_by, moves_joint, moves_readings, remeasured, settled, stands
 
 _CLOSER_LOOKS = 2
@@ -86,9 +88,7 @@ def _under(
         crew,
     )
     for _ in range(_FORETOLD_PASSES if still else 1):
-        there = crew.here(
-            lambda r: balance.foretold_under(r, balance.sum_of(balance.known_forces(r), explained(r))), there
-        )
+        there = crew.here(lambda r: balance.foretold_under(r, sum_of_forces(known_forces(r), explained(r))), there)
     search = Competition(
         there,
         first.judge.training_count,

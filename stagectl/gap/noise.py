@@ -11,10 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from stagectl.gap import balance
-from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.believed import Believed
+from stagectl.gap.forces import Forces
 from stagectl.gap.innovations import Noise
 from stagectl.gap.motion import SLOW_CORNER_RAD_PER_S, SLOW_FORCE_N
+from stagectl.gap.recording import Recording
 
 _FORCES_N = (0.0, *(1e-3 * 2.0**k for k in range(14)))
 _STRETCH = 512

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from stagectl.gap import balance
-from stagectl.gap.balance import Forces
 from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.effect_forces import known_forces
+from stagectl.gap.forces import Forces
 from stagectl.gap.log import Log
 from stagectl.trajectory import Trajectory
 
@@ -52,7 +53,7 @@ class _Others:
 
 def _others(still: Log, believed: Believed) -> _Others:
     """Evaluate what is believed along a log without commands; effects of a motor are nothing there."""
-    return _Others(balance.known_forces(balance.recording_of(still, believed)), still.samples_count)
+    return _Others(known_forces(balance.recording_of(still, believed)), still.samples_count)
 
 
 def _with_commands(still: Log, believed: Believed, macro_n: np.ndarray, micro_n: np.ndarray | None) -> Log:

@@ -15,9 +15,11 @@ from scipy.signal import butter, sosfiltfilt
 
 from stagectl.errors import RequestError
 from stagectl.gap import balance, residual
-from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.believed import Believed
+from stagectl.gap.effect_forces import known_forces
+from stagectl.gap.forces import Forces
 from stagectl.gap.log import STILL_M, Log, constant_columns
+from stagectl.gap.recording import Recording
 
 _BAND_HZ = (0.2, 30.0)
 _EDGE_S = 0.3
@@ -169,7 +171,7 @@ def _band_pass(period_s: float) -> np.ndarray:
 def _balance(recording: Recording, axis: str) -> _Balance:
     h, motion = recording.log.period_s, recording.motion(axis)
     raw_n = residual.missing_force_n(recording, axis, Forces())
-    left_n = residual.missing_force_n(recording, axis, balance.known_forces(recording))
+    left_n = residual.missing_force_n(recording, axis, known_forces(recording))
     inertia_n, force_n = _in_band(recording, raw_n), _in_band(recording, raw_n - left_n)
     velocity = motion.velocity_m_per_s.mean(axis=1)
     others = [velocity, np.sign(velocity), motion.position_m.mean(axis=1)]

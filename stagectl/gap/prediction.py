@@ -23,13 +23,15 @@ from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.addition import parted
-from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.believed import Believed
+from stagectl.gap.effect_forces import effect_forces
 from stagectl.gap.findings import Findings, Named, ParameterError
+from stagectl.gap.forces import Forces, scaled_forces
 from stagectl.gap.grids import grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.log import Log
 from stagectl.gap.noise import noise_of
+from stagectl.gap.recording import Recording
 
 SIGMAS = 1.96
 """Of a 95 % interval."""
@@ -345,7 +347,7 @@ def _mean_values(effect: Named) -> dict[str, float]:
 
 def _column(recording: Recording, effect: Named, values: dict[str, float]) -> np.ndarray:
     known = CATALOGUE[effect.name]
-    forces = balance.effect_forces(recording, known, effect.acts_on, [values[name] for name in known.parameters])
+    forces = effect_forces(recording, known, effect.acts_on, [values[name] for name in known.parameters])
     return column(recording, forces)
 
 
@@ -445,12 +447,12 @@ def _size(recording: Recording, target: Named | ParameterError, seen: Evidence) 
     if isinstance(target, Named):
         known = CATALOGUE[target.name]
         values = _mean_values(target)
-        forces = balance.effect_forces(recording, known, target.acts_on, [values[name] for name in known.parameters])
+        forces = effect_forces(recording, known, target.acts_on, [values[name] for name in known.parameters])
     else:
         forces = Forces()
         parts = hypotheses.parts_of(target.name)
         for one in (force for term, _ in seen.base if term.name in parts for force in term.forces(recording)):
-            forces = balance.scaled(one, target.error, forces)
+            forces = scaled_forces(one, target.error, forces)
     error_m = forces.macro_sensor_m if forces.macro_sensor_m is not None else forces.end_sensor_m
     if error_m is not None:
         return "m", _rms(error_m)

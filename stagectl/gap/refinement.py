@@ -13,11 +13,12 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from stagectl.effects import CATALOGUE, Trait
-from stagectl.gap import balance, hypotheses
+from stagectl.gap import hypotheses
 from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.grids import free_shapes
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Placed, active_slots, covers, normal_of
+from stagectl.gap.reading_errors import moved_m
 
 _SWEEPS = 2
 _BRACKET = 2.2  # from the grid's place, up and down
@@ -113,10 +114,10 @@ class Refiner:
         shape = {name: term.shape.get(name, 0.0) for name in effect.parameters}
         if term.acts_on.endswith(("_sensor", "contact_edge")):
             unit = 1e-3 * high
-            moved_m = max(
-                balance.moved_m(r, effect, term.acts_on, shape | {amplitude: unit}) for r in self._evidence.recordings
+            moves_m = max(
+                moved_m(r, effect, term.acts_on, shape | {amplitude: unit}) for r in self._evidence.recordings
             )
-            sizes = [sign * size_m * unit / max(moved_m, 1e-300) for size_m in _MOVED_M for sign in (1.0, -1.0)]
+            sizes = [sign * size_m * unit / max(moves_m, 1e-300) for size_m in _MOVED_M for sign in (1.0, -1.0)]
         else:
             asked = float(self._amplitudes(self._evidence.columns_of(term), term)[0])
             sizes = [step * max(asked, 0.02) * term.shape[amplitude] for step in _STEPS]

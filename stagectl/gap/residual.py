@@ -18,11 +18,13 @@ from scipy.signal import butter, sosfiltfilt, sosfreqz
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.arbiter import lap_samples
-from stagectl.gap.balance import Forces, Recording
 from stagectl.gap.believed import Believed
+from stagectl.gap.effect_forces import effect_forces, known_forces
 from stagectl.gap.findings import Findings, Named
+from stagectl.gap.forces import Forces, add_forces
 from stagectl.gap.log import Log
 from stagectl.gap.motion import PARTS_COUNT
+from stagectl.gap.recording import Recording
 
 NOISE_FORCE_N = 0.05
 """Rms of the sensor's noise in the residual force; the force that nobody models is about as large."""
@@ -139,7 +141,7 @@ def residuals(believed: Believed, findings: Findings, training: Sequence[Log], h
     found = []
     for log, held_out in [*((log, False) for log in training), *((log, True) for log in held)]:
         recording = balance.recording_of(log, believed)
-        before = balance.known_forces(recording)
+        before = known_forces(recording)
         after = modelled_forces(recording, findings)
         found += [_residual(recording, axis, held_out, before, after) for axis in recording.axes]
     return found
@@ -147,16 +149,16 @@ def residuals(believed: Believed, findings: Findings, training: Sequence[Log], h
 
 def modelled_forces(recording: Recording, findings: Findings) -> Forces:
     """Sum what acts after all: known forces with parameters as refitted, and the named effects."""
-    total = balance.known_forces(recording)
+    total = known_forces(recording)
     for term, _ in hypotheses.parameter_terms(recording):
         error = findings.refitted.get(term.name, 0.0)
         for forces in term.forces(recording):
-            balance.add(total, _scaled(forces, error))
+            add_forces(total, _scaled(forces, error))
     for named in findings.named:
         effect = CATALOGUE[named.name]
         own = own_parameters(named, recording.log)
         values = [own.get(name, 0.0) for name in effect.parameters]
-        balance.add(total, balance.effect_forces(recording, effect, named.acts_on, values, whole=True))
+        add_forces(total, effect_forces(recording, effect, named.acts_on, values, whole=True))
     return total
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stagectl.gap import innovations
-from stagectl.gap.balance import Recording
+from stagectl.gap.recording import Recording
 
 PEAKS_COUNT = 4
 _CELLS_PER_PITCH = 6.0

@@ -12,7 +12,6 @@ import numpy as np
 
 from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap import balance, hypotheses
-from stagectl.gap.balance import Moved, Recording
 from stagectl.gap.believed import Believed
 from stagectl.gap.competition import Competition
 from stagectl.gap.contact import CONTACT_DAMPING, contact_damping_n_s_per_m
@@ -22,6 +21,8 @@ from stagectl.gap.findings import Named
 from stagectl.gap.hypotheses import DEVIATION_SD, Term, widest_amplitudes
 from stagectl.gap.innovations import Noise
 from stagectl.gap.normal_equations import Group, solve
+from stagectl.gap.operating_point import Moved, operating_point, with_joint_changed
+from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import LATCH_SDS, whole_of
 
 _EDGE_PASSES = 3
@@ -86,8 +87,8 @@ def settled(
 
 def _put(out: dict[str, float], moved: tuple[Moved, ...], recording: Recording) -> Recording:
     """Return a recording with a joint that is changed, and with effects that move it taken out."""
-    there = balance.with_joint_changed(recording, out["left_m"], out["right_m"], out[_DAMPING])
-    return balance.operating_point(there, moved) if moved else there
+    there = with_joint_changed(recording, out["left_m"], out["right_m"], out[_DAMPING])
+    return operating_point(there, moved) if moved else there
 
 
 def settled_by(believed: Believed, recording: Recording) -> dict[str, float]:

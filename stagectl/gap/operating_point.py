@@ -1,0 +1,86 @@
+"""Recordings with the joint and the readings put where effects have them. Pure."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from stagectl.effects import Effect, Trait
+from stagectl.gap.balance import recording_of
+from stagectl.gap.believed import Believed
+from stagectl.gap.contact import CONTACT_DAMPING
+from stagectl.gap.quantities import along_motion, in_order, quantities
+from stagectl.gap.reading_errors import other_instants_s, reading_error_m
+from stagectl.gap.recording import Recording
+
+Moved = tuple[Effect, str, dict[str, float]]
+"""An effect that moves the joint's geometry or the readings, its place, its parameters."""
+
+
+_CORRECTIONS = 2
+
+
+def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
+    """Return a recording with sensor errors taken out of its positions and edges where effects have put them.
+
+    moved: effects that move the joint's geometry, with their places and parameters. What a sensor adds is taken along
+    the readings at first, then along the motion that is left without it.
+    """
+    raw, believed = recording.log, recording.believed
+    there = recording
+    for effect, place, values in moved:
+        if not place.endswith("_sensor") and believed.joint is not None:
+            known = quantities(recording, "end", place)
+            out_m = {}
+            for side in (-1.0, 1.0):
+                sided = known | {"contact_side_ratio": np.full_like(known["contact_side_ratio"], side)}
+                out_m[side] = float(
+                    np.mean(along_motion(effect, [sided[name] for name in effect.quantities], in_order(effect, values)))
+                )
+            believed = _edges_out(believed, out_m[-1.0], out_m[1.0])
+    for number in range(_CORRECTIONS if any(place.endswith("_sensor") for _, place, _ in moved) else 1):
+        log = raw
+        for effect, place, values in moved:
+            parameters = in_order(effect, values)
+            if place == "macro_sensor":
+                true_m = _true_m(there, log.macro_position_m, effect, place, parameters, number == 0)
+                log = replace(log, macro_position_m=true_m)
+            elif place == "end_sensor" and log.end_position_m is not None:
+                true_m = _true_m(there, log.end_position_m, effect, place, parameters, number == 0)
+                log = replace(log, end_position_m=true_m)
+        there = recording_of(log, believed)
+    return there
+
+
+def _true_m(
+    recording: Recording, read_m: np.ndarray, effect: Effect, place: str, parameters: list[float], first: bool
+) -> np.ndarray:
+    """Return readings without what a sensor effect adds; those of other instants are read where they are taken."""
+    error_m = reading_error_m(recording, effect, place, parameters, first)[:, 0]
+    if Trait.TIME_SHIFT not in effect.traits:
+        return read_m - error_m
+    times_s = recording.log.times_s
+    known = quantities(recording, "macro" if place.startswith("macro") else "end", place)
+    taken_s = other_instants_s(recording, effect, parameters, known, backwards=True)
+    inside = (taken_s >= times_s[0]) & (taken_s <= times_s[-1])
+    return np.where(inside, CubicSpline(times_s, read_m)(np.where(inside, taken_s, times_s)), read_m - error_m)
+
+
+def with_joint_changed(recording: Recording, left_out_m: float, right_out_m: float, damping_ratio: float) -> Recording:
+    """Return a recording whose joint has its edges further out, and a contact damping that is larger by a ratio."""
+    believed = _edges_out(recording.believed, left_out_m, right_out_m)
+    effects = tuple(
+        {**row, "damping_n_s_per_m": row["damping_n_s_per_m"] * (1.0 + damping_ratio)}
+        if row["name"] == CONTACT_DAMPING
+        else row
+        for row in believed.effects
+    )
+    return recording_of(recording.log, replace(believed, effects=effects))
+
+
+def _edges_out(believed: Believed, left_m: float, right_m: float) -> Believed:
+    joint = believed.joint
+    if joint is None:
+        return believed
+    return replace(believed, joint=replace(joint, left_m=joint.left_m + left_m, right_m=joint.right_m + right_m))

@@ -1,0 +1,117 @@
+"""One log with all that does not depend on a hypothesis: motion, motor forces, where the joint touches. Pure."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.command_path import delayed, driven
+from stagectl.gap.contact import Contact, contact_at
+from stagectl.gap.innovations import Noise
+from stagectl.gap.log import Log
+from stagectl.gap.motion import Motion, motion_of
+
+AXES = ("macro", "end")
+"""Bodies; the second one is the micro's, its position the end's."""
+
+
+@dataclass(slots=True)
+class Recording:
+    """One log with all that does not depend on a hypothesis."""
+
+    log: Log
+    believed: Believed
+    macro: Motion
+    end: Motion | None
+    macro_command_n: np.ndarray
+    micro_command_n: np.ndarray | None
+    penetration_m: np.ndarray | None
+    penetration_velocity_m_per_s: np.ndarray | None
+    side: np.ndarray | None
+    filters: dict[str, tuple[Noise, np.ndarray, np.ndarray]]
+    judged: dict[str, np.ndarray]
+    known: dict[tuple[str, str], dict[str, np.ndarray]]  # quantities by axis and kind of place, once asked for
+    reported_a: dict[str, np.ndarray]  # reported minus believed current at the samples, by axis, where it is known
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Bodies that this log has."""
+        return AXES if self.end is not None else AXES[:1]
+
+    @property
+    def reaction_ratio(self) -> float:
+        """Share of the micro's motor force that is believed to push the macro back."""
+        return sum(row["fraction_ratio"] for row in self.believed.effects if row["name"] == "micro_reaction")
+
+    def motion(self, axis: str) -> Motion:
+        """Motion of one body."""
+        motion = self.macro if axis == "macro" else self.end
+        if motion is None:
+            raise KeyError(axis)
+        return motion
+
+    def position_m(self, axis: str) -> np.ndarray:
+        """Measured position of one body."""
+        position = self.log.macro_position_m if axis == "macro" else self.log.end_position_m
+        if position is None:
+            raise KeyError(axis)
+        return position
+
+    def belief(self, axis: str) -> BelievedAxis:
+        """What is believed of one body and its motor."""
+        if axis == "macro" or self.believed.micro is None:
+            return self.believed.macro
+        return self.believed.micro
+
+    def mass_kg(self, axis: str) -> float:
+        """Believed mass of one body with what it carries."""
+        payload_kg = self.log.macro_payload_kg if axis == "macro" else self.log.end_payload_kg
+        return self.belief(axis).mass_kg + payload_kg
+
+    def force_constant_n_per_a(self, axis: str) -> float:
+        """Believed force constant of one motor."""
+        return self.belief(axis).force_constant_n_per_a
+
+    def held_command_n(self, axis: str) -> np.ndarray:
+        """Commanded force as the drive holds it, before its current loop, shape (n, parts)."""
+        command_n = self.log.macro_command_n if axis == "macro" else self.log.micro_command_n
+        if command_n is None:
+            return np.zeros_like(self.macro.position_m)
+        return delayed(command_n, self.belief(axis).latch_s / self.log.period_s)
+
+
+def put_together(log: Log, believed: Believed, macro: Motion, end: Motion | None) -> Recording:
+    """Put together what is known along a motion; without one of the end, its own is made of the positions alone."""
+    h = log.period_s
+    macro_n, macro_at_n = driven(log.macro_command_n, believed.macro.latch_s, believed.macro.current_loop_s, h)
+    at_samples_n = {"macro": macro_at_n}
+    micro_n = depth = depth_rate = side = None
+    if log.end_position_m is not None and log.micro_command_n is not None and believed.micro is not None:
+        end = end or motion_of(log.end_position_m, h, believed.micro.noise_m)
+        micro_n, at_samples_n["end"] = driven(
+            log.micro_command_n, believed.micro.latch_s, believed.micro.current_loop_s, h
+        )
+        if believed.joint is not None:
+            x_b, x_b_rate = relative_motion(macro, end)
+            contact = contact_at(believed, believed.joint, x_b, x_b_rate)
+            side, depth, depth_rate = contact.side, contact.depth_m, contact.depth_rate_m_per_s
+    else:
+        end = None
+    recording = Recording(log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {})
+    for axis, reported_a in (("macro", log.macro_current_a), ("end", log.micro_current_a)):
+        if axis in recording.axes and reported_a is not None and recording.belief(axis).current_noise_a is not None:
+            believed_a = at_samples_n[axis] / recording.belief(axis).force_constant_n_per_a
+            recording.reported_a[axis] = reported_a - believed_a
+    return recording
+
+
+def contact_of(recording: Recording) -> Contact:
+    side, depth_m, rate = recording.side, recording.penetration_m, recording.penetration_velocity_m_per_s
+    if side is None or depth_m is None or rate is None:
+        raise KeyError("joint")
+    return Contact(side, depth_m, rate)
+
+
+def relative_motion(macro: Motion, end: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Return x_b = macro minus end on parts of intervals, and its rate."""
+    return macro.position_m - end.position_m, macro.velocity_m_per_s - end.velocity_m_per_s
