@@ -18,6 +18,7 @@ from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import log_of_rows, read_log
 from stagectl.gap.planned import planned_log
+from stagectl.gap.predicted_columns import observed, prepared
 from stagectl.profile import load_profile
 from stagectl.record import read_run
 from stagectl.stage import open_stage
@@ -161,8 +162,8 @@ def test_every_move_keeps_to_travel_and_limits(stage):
 def test_planned_commands_leave_no_gap(stage, settled):
     """Under the commands that were planned for it a believed machine moves as planned, to within the noise."""
     believed = settled[0]
-    recording = prediction.prepared(planned_log(stage[1]["middle stroke"].trajectory, believed), believed)
-    z = prediction.observed(recording)
+    recording = prepared(planned_log(stage[1]["middle stroke"].trajectory, believed), believed)
+    z = observed(recording)
     assert np.sqrt(np.mean(z * z)) < 1.0
 
 

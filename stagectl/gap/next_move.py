@@ -17,6 +17,7 @@ from stagectl.gap.findings import Findings, Named
 from stagectl.gap.grids import grids_for
 from stagectl.gap.moves import Move
 from stagectl.gap.planned import planned_log
+from stagectl.gap.predicted_columns import column, prepared
 from stagectl.gap.prediction import DETECTED, Evidence, Expected
 
 MOVES: dict[str, tuple[str, ...]] = {
@@ -97,14 +98,14 @@ def excitations(believed: Believed, findings: Findings, moves: Sequence[Move]) -
         return []
     best: dict[str, tuple[float, str]] = {}
     for move in moves:
-        recording = prediction.prepared(planned_log(move.trajectory, believed), believed)
+        recording = prepared(planned_log(move.trajectory, believed), believed)
         if not sum(size for _, size in channels(recording)):
             continue
         for term in hypotheses.effect_terms([recording], grids_for([recording])):
             name = f"{term.name} on {term.acts_on}"
             if name not in wanted:
                 continue
-            energy = max(float(np.sum(prediction.column(recording, forces) ** 2)) for forces in term.forces(recording))
+            energy = max(float(np.sum(column(recording, forces) ** 2)) for forces in term.forces(recording))
             if energy > best.get(name, (0.0, ""))[0]:
                 best[name] = (energy, move.name)
     return [(name, best[name][1]) for name in sorted(best)]

@@ -16,42 +16,51 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.addition import parted
 from stagectl.gap.believed import Believed
+from stagectl.gap.coloured_rest import filters_of, whitened_rest
 from stagectl.gap.effect_forces import effect_forces
 from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.forces import Forces, scaled_forces
 from stagectl.gap.grids import grids_for
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.log import Log
-from stagectl.gap.noise import noise_of
+from stagectl.gap.predicted_columns import (
+    _mean_values,
+    effect_columns,
+    observed,
+    prepared,
+    stacked_columns,
+)
 from stagectl.gap.recording import Recording
 
 SIGMAS = 1.96
 """Of a 95 % interval."""
 
+
 LAW_SD_RATIO = 0.003
 """How exact a law is along a motion that is only measured: a true friction of 6 N showed 99.6 % of itself."""
+
 
 DETECTED = 5.0
 """Distance in standard deviations from which an effect counts as seen."""
 
+
 SEPARATED = 9.0
 """Twice the log of the likelihood ratio beyond which of two names one is out."""
+
 
 _MATERIAL_RATIO = 0.01
 """Share of an effect's own energy below which a margin may be the model's, not the name's."""
 
+
 _MOTION_RATIO = 0.01
 """Standard deviation of an effect's size on a motion against that on the motion as planned."""
 
-_AR_ORDER = 12
 
 Columns = Callable[[Recording, np.ndarray], np.ndarray]
 """What a hypothesis does to a recording's innovations, shape (m, k); the second argument is where phases come from."""
@@ -156,12 +165,12 @@ def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evi
         for other, block in known:
             if other is recording:
                 return block
-        return _stack(recording, [forces for term, _ in base for forces in term.forces(recording)])
+        return stacked_columns(recording, [forces for term, _ in base for forces in term.forces(recording)])
 
     def columns(recording: Recording, rest: np.ndarray) -> np.ndarray:
         found = base_columns(recording)
         free = rest - found @ base_values
-        return np.column_stack([found, *_effect_columns(recording, named, free)])
+        return np.column_stack([found, *effect_columns(recording, named, free)])
 
     values = np.concatenate([base_values, np.ones(len(named))])
     blocks = []
@@ -173,8 +182,8 @@ def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evi
     prior = np.array([0.0 if term.name in free else 1.0 / sd**2 for term, sd in base] + [0.0] * len(named))
     wanted = {alias[:2] for one in named for alias in one.aliases}
     terms = [term for term in hypotheses.effect_terms(recordings, grids_for(recordings)) if term.key in wanted]
-    filters = _filters(blocks, prior, terms)
-    white = [(_white(r, z, filters), _white(r, d, filters)) for r, z, d in blocks]
+    filters = filters_of(blocks, prior, terms)
+    white = [(whitened_rest(r, z, filters), whitened_rest(r, d, filters)) for r, z, d in blocks]
     covariance = np.linalg.inv(sum((d.T @ d for _, d in white), np.diag(prior)))
     model = _Model(columns, values, covariance)
     late_ratio = float(np.mean([1.0 - log.valid.mean() for log in logs]))
@@ -197,7 +206,7 @@ def expected(seen: Evidence, log: Log) -> list[Expected]:
     recording = prepared(log, seen.believed)
     nothing = np.zeros(sum(size for _, size in balance.channels(recording)))
     raw = seen.model.columns(recording, nothing)
-    d = _white(recording, raw, seen.filters)
+    d = whitened_rest(recording, raw, seen.filters)
     first = len(seen.base)
     found = []
     for number, target in enumerate(seen.targets):
@@ -232,7 +241,7 @@ def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Ou
     recording = prepared(log, seen.believed)
     z = observed(recording)
     raw = seen.model.columns(recording, z)
-    d, zw = _white(recording, raw, seen.filters), _white(recording, z, seen.filters)
+    d, zw = whitened_rest(recording, raw, seen.filters), whitened_rest(recording, z, seen.filters)
     whole = zw - d @ seen.model.values
     mine = _surprise(whole, d, seen.model.covariance)
     outcomes = []
@@ -246,7 +255,7 @@ def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Ou
         fall = size * (2.0 * share - 1.0)
         margins = []
         for key, rival in seen.rivals.get((target.name, target.acts_on), {}).items():
-            other = _white(recording, rival.columns(recording, z), seen.filters)
+            other = whitened_rest(recording, rival.columns(recording, z), seen.filters)
             margins.append((*key, _surprise(zw - other @ rival.values, other, rival.covariance) - mine))
         low, high = prediction.share_interval
         # how large the forces are that a wrong parameter scales is part of what the plan can't know
@@ -266,147 +275,9 @@ def judged(seen: Evidence, log: Log, predictions: Sequence[Expected]) -> list[Ou
     return outcomes
 
 
-def prepared(log: Log, believed: Believed) -> Recording:
-    """Prepare a log with the noise that the search begins with."""
-    recording = balance.recording_of(log, believed)
-    balance.set_noise(recording, noise_of([recording]))
-    return recording
-
-
-def observed(recording: Recording) -> np.ndarray:
-    """Return the innovations of all channels, one behind the other."""
-    return np.concatenate(balance.observed(recording))
-
-
-def column(recording: Recording, forces: Forces) -> np.ndarray:
-    """Return what forces add to the innovations of all channels, one behind the other."""
-    parts = zip(balance.channels(recording), balance.column(recording, forces), strict=True)
-    return np.concatenate([np.zeros(size) if part is None else part for (_, size), part in parts])
-
-
 def _per_run(effect: Named) -> bool:
     """Tell whether an effect has another size in each run: there is nothing to predict."""
     return any(parted(name)[1].startswith("run ") for name in effect.parameters)
-
-
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """What an effect does as found: one column, or for each amplitude with a free phase its sine and cosine."""
-
-    column: np.ndarray | None
-    pairs: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
-
-
-def _effect_columns(recording: Recording, named: Sequence[Named], rest: np.ndarray) -> list[np.ndarray]:
-    """Return what each effect does as found; phases of a homing are those that suit the rest best."""
-    parts = [_part(recording, effect) for effect in named]
-    waves = [wave for part in parts for pair in part.pairs for wave in pair]
-    shares = np.zeros(0)
-    if waves:
-        fixed = sum((part.column for part in parts if part.column is not None), np.zeros(rest.size))
-        stacked = np.column_stack(waves)
-        scale = np.maximum(np.sqrt(np.einsum("ij,ij->j", stacked, stacked)), 1e-300)
-        shares = np.linalg.lstsq(stacked / scale, rest - fixed, rcond=1e-9)[0] / scale
-    found, place = [], 0
-    for part in parts:
-        total = np.zeros(rest.size) if part.column is None else part.column
-        for sine, cosine in part.pairs:
-            a, b = shares[place], shares[place + 1]
-            place += 2
-            length = float(np.hypot(a, b))
-            a, b = (a / length, b / length) if length > 0.0 else (1.0, 0.0)
-            total = total + a * sine + b * cosine
-        found.append(total)
-    return found
-
-
-def _part(recording: Recording, effect: Named) -> _Part:
-    """Evaluate an effect as found; where its phases are those of homings, at both quadratures."""
-    known = CATALOGUE[effect.name]
-    values = _mean_values(effect)
-    pairs = [(name, hypotheses.phase_of(known, name)) for name in known.linear]
-    free = [(name, phase) for name, phase in pairs if phase is not None]
-    if not free or {parted(name)[1] for name in effect.parameters} == {""}:
-        return _Part(_column(recording, effect, values))
-    found = []
-    for name, phase in free:
-        alone = values | {other: 0.0 for other, _ in free if other != name}
-        sine, cosine = (_column(recording, effect, alone | {phase: angle}) for angle in (0.0, 0.5 * np.pi))
-        found.append((sine, cosine))
-    return _Part(None, tuple(found))
-
-
-def _mean_values(effect: Named) -> dict[str, float]:
-    """Return every parameter's value, of those that differ from homing to homing the mean."""
-    values: dict[str, list[float]] = {}
-    for name, value in effect.parameters.items():
-        values.setdefault(parted(name)[0], []).append(value)
-    known = CATALOGUE[effect.name].parameters
-    return {name: float(np.mean(values.get(name, [0.0]))) for name in known}
-
-
-def _column(recording: Recording, effect: Named, values: dict[str, float]) -> np.ndarray:
-    known = CATALOGUE[effect.name]
-    forces = effect_forces(recording, known, effect.acts_on, [values[name] for name in known.parameters])
-    return column(recording, forces)
-
-
-def _stack(recording: Recording, forces: Sequence[Forces]) -> np.ndarray:
-    return np.column_stack([column(recording, one) for one in forces])
-
-
-def _filters(
-    blocks: Sequence[tuple[Recording, np.ndarray, np.ndarray]], prior: np.ndarray, terms: Sequence[Term]
-) -> dict[str, tuple[np.ndarray, float]]:
-    """Fit an autoregression a channel (Yule-Walker) to what effects and aliases together leave of all recordings.
-
-    What only a wrong name leaves is no noise: taken for noise it would hide the right one.
-    """
-    wide = []
-    for recording, _, d in blocks:
-        more = [forces for term in terms for forces in term.forces(recording)]
-        wide.append(np.column_stack([d, _stack(recording, more)]) if more else d)
-    precision = np.concatenate([prior, np.zeros(wide[0].shape[1] - prior.size)])
-    normal = sum((d.T @ d for d in wide), np.diag(precision))
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    normal = normal / np.outer(scale, scale) + 1e-9 * np.eye(scale.size)
-    right = sum((d.T @ z for (_, z, _), d in zip(blocks, wide, strict=True)), np.zeros(scale.size))
-    values = np.linalg.solve(normal, right / scale) / scale
-    rests = [(recording, z - d @ values) for (recording, z, _), d in zip(blocks, wide, strict=True)]
-    sums: dict[str, np.ndarray] = {}
-    counts: dict[str, float] = {}
-    for recording, rest in rests:
-        start = 0
-        for name, size in balance.channels(recording):
-            part = rest[start : start + size]
-            start += size
-            if size <= _AR_ORDER:
-                continue
-            covariance = np.array([part[: size - k] @ part[k:] for k in range(_AR_ORDER + 1)])
-            sums[name] = sums.get(name, 0.0) + covariance
-            counts[name] = counts.get(name, 0.0) + size
-    found = {}
-    for name, total in sums.items():
-        covariance = total / counts[name]
-        covariance[0] *= 1.0 + 1e-9
-        coefficients = solve_toeplitz(covariance[:-1], covariance[1:])
-        left = float(covariance[0] - coefficients @ covariance[1:])
-        found[name] = (coefficients, float(np.sqrt(max(left, 1e-300))))
-    return found
-
-
-def _white(recording: Recording, values: np.ndarray, filters: dict[str, tuple[np.ndarray, float]]) -> np.ndarray:
-    """Pass columns through each channel's filter, shape kept but for what it takes to start."""
-    start, parts = 0, []
-    for name, size in balance.channels(recording):
-        part = values[start : start + size]
-        start += size
-        if size <= _AR_ORDER:
-            continue
-        coefficients, sd = filters[name]
-        done = np.asarray(lfilter(np.concatenate([[1.0], -coefficients]), [1.0], part, axis=0))
-        parts.append(done[_AR_ORDER:] / sd)
-    return np.concatenate(parts)
 
 
 def _scatter(white: Sequence[tuple[np.ndarray, np.ndarray]], values: np.ndarray, along: np.ndarray) -> float:
@@ -488,10 +359,10 @@ def _rivals(
         def columns(recording: Recording, rest: np.ndarray, term: Term = term) -> np.ndarray:
             found = base_columns(recording)
             free = rest - found @ base_values
-            fixed = _effect_columns(recording, others, free) if others else []
-            return np.column_stack([found, *fixed, _stack(recording, term.forces(recording))])
+            fixed = effect_columns(recording, others, free) if others else []
+            return np.column_stack([found, *fixed, stacked_columns(recording, term.forces(recording))])
 
-        white = [(_white(r, z, filters), _white(r, columns(r, z), filters)) for r, z, _ in blocks]
+        white = [(whitened_rest(r, z, filters), whitened_rest(r, columns(r, z), filters)) for r, z, _ in blocks]
         precision = np.concatenate([prior[: base_values.size], np.zeros(white[0][1].shape[1] - base_values.size)])
         normal = sum((d.T @ d for _, d in white), np.diag(precision))
         normal += 1e-9 * np.diag(np.diag(normal))
@@ -507,7 +378,7 @@ def _separation(
     recording: Recording, seen: Evidence, base: np.ndarray, s: np.ndarray, rival: _Model, planned: np.ndarray
 ) -> float:
     """Return d' between an effect as found and its best rival, after what known parameters may take over."""
-    other = _white(recording, rival.columns(recording, planned), seen.filters)
+    other = whitened_rest(recording, rival.columns(recording, planned), seen.filters)
     first = base.shape[1]
     mine = s + base @ seen.base_values
     apart = mine - other @ rival.values
