@@ -165,8 +165,10 @@ function take(message) {
 function listen() {
   const stream = new WebSocket(`ws://${location.host}/v1/stream`);
   stream.onmessage = (event) => take(JSON.parse(event.data));
-  stream.onclose = () => {
-    showLost('The page\'s process is gone, or let go of this page.');
+  stream.onclose = async () => {
+    const answer = await fetch('/session').catch(() => null);
+    const stranger = answer?.status === 401 ? await answer.json().catch(() => null) : null;
+    showLost(stranger ? `This page is not known any more: ${stranger.message}.` : 'The page\'s process is gone, or let go of this page.');
     setTimeout(listen, AGAIN_MS);
   };
 }
