@@ -28,6 +28,7 @@ Socket = Annotated[Path | None, option("Socket of the service.", "--socket", met
 TcpPort = Annotated[
     int | None, option("Listen on this port of 127.0.0.1 too, for clients with a token.", "--tcp", metavar="PORT")
 ]
+PagePort = Annotated[int, option("Port of 127.0.0.1 to show the page on; 0 takes any.", "--port", metavar="PORT")]
 StateFolder = Annotated[
     Path | None, option("Folder of what survives a restart, and of the tokens.", "--state", metavar="FOLDER")
 ]
@@ -73,6 +74,15 @@ def status(socket: Socket = None, json: Json = False) -> None:
 def watch(count: LooksCount = None, socket: Socket = None, json: Json = False) -> None:
     """Show the status again and again; with --json one object a line before the last."""
     deliver("watch", json, lambda voice: commands.remote.watch(voice, socket, json, count), compiles=False)
+
+
+@service_app.command(epilog=epilog("stagectl page", "stagectl page --port 8702 --runs /var/lib/stagectl/runs"))
+def page(port: PagePort = 8701, runs: ServedRuns = Path("runs"), socket: Socket = None, json: Json = False) -> None:
+    """Show the live page to browsers on this machine, until Ctrl-C: scope, states, jog and moves, runs, and STOP.
+
+    The links stand on stdout, one a line; with --json an object a line.
+    """
+    deliver("page", json, lambda voice: commands.page.page(voice, socket, port, runs, json), compiles=False)
 
 
 @service_app.command(epilog=epilog("stagectl stop"))

@@ -89,20 +89,26 @@ class Access:
             return
         role = Role.OPERATE if self._tokens is None else role_of(self._tokens, _bearer(scope))
         if role is None:
-            await _refuse(scope, send, 401, "a token is needed: Authorization: Bearer TOKEN, as the tokens file has it")
+            await refuse(scope, send, 401, "a token is needed: Authorization: Bearer TOKEN, as the tokens file has it")
             return
-        scope["stagectl_role"] = role
-        length = _header(scope, b"content-length")
-        if length and (not length.isdigit() or int(length) > BODY_LIMIT_BYTES):
-            await _refuse(scope, send, 413, f"Content-Length {length[:20]}: the limit is {BODY_LIMIT_BYTES} bytes")
-            return
-        if scope["type"] == "http" and not length and _header(scope, b"transfer-encoding"):
-            await _refuse(scope, send, 411, "send a Content-Length; bodies in pieces are not taken")
-            return
-        await self._application(scope, receive, send)
+        await let_in(self._application, role, scope, receive, send)
 
 
-def _header(scope: Scope, name: bytes) -> str:
+async def let_in(application: Application, role: Role, scope: Scope, receive: Receive, send: Send) -> None:
+    """Pass a connection on with its role, unless its body is above the limit."""
+    scope["stagectl_role"] = role
+    length = header(scope, b"content-length")
+    if length and (not length.isdigit() or int(length) > BODY_LIMIT_BYTES):
+        await refuse(scope, send, 413, f"Content-Length {length[:20]}: the limit is {BODY_LIMIT_BYTES} bytes")
+        return
+    if scope["type"] == "http" and not length and header(scope, b"transfer-encoding"):
+        await refuse(scope, send, 411, "send a Content-Length; bodies in pieces are not taken")
+        return
+    await application(scope, receive, send)
+
+
+def header(scope: Scope, name: bytes) -> str:
+    """Return the first header of a name (lower case); empty where there is none."""
     for key, value in scope.get("headers", ()):
         if key == name:
             return value.decode("latin-1")
@@ -110,11 +116,12 @@ def _header(scope: Scope, name: bytes) -> str:
 
 
 def _bearer(scope: Scope) -> str:
-    kind, _, token = _header(scope, b"authorization").partition(" ")
+    kind, _, token = header(scope, b"authorization").partition(" ")
     return token.strip() if kind.lower() == "bearer" else ""
 
 
-async def _refuse(scope: Scope, send: Send, code: int, message: str) -> None:
+async def refuse(scope: Scope, send: Send, code: int, message: str) -> None:
+    """Answer a connection that may not come in: a status with JSON, or a closed WebSocket."""
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 1008, "reason": message[:120]})
         return

@@ -4,6 +4,7 @@ import asyncio
 import socket
 import threading
 from collections.abc import Sequence
+from typing import Literal
 
 import uvicorn
 
@@ -17,14 +18,17 @@ _START_S = 10.0
 class Listener:
     """Serves applications on sockets until `close`."""
 
-    def __init__(self, served: Sequence[tuple[socket.socket, Application]]):
-        """Take sockets that listen already; nothing is answered before `start`."""
+    def __init__(self, served: Sequence[tuple[socket.socket, Application]], lifespan: Literal["on", "off"] = "off"):
+        """Take sockets that listen already; nothing is answered before `start`.
+
+        `lifespan` "on": the applications are told of their beginning and end.
+        """
         self._sockets = [listening for listening, _ in served]
         self._servers = [
             uvicorn.Server(
                 uvicorn.Config(
                     application,  # pyright: ignore[reportArgumentType]
-                    lifespan="off",
+                    lifespan=lifespan,
                     log_config=None,
                     access_log=False,
                     ws="websockets-sansio",

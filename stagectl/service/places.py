@@ -66,10 +66,10 @@ def listen_unix(path: Path) -> socket.socket:
     return listening
 
 
-def listen_tcp(port: int) -> socket.socket:
-    """Listen on a port of 127.0.0.1. Errors: LinkError, RequestError."""
+def listen_tcp(port: int, option: str = "--tcp") -> socket.socket:
+    """Listen on a port of 127.0.0.1, which an option of the command line gave. Errors: LinkError, RequestError."""
     if not 0 <= port <= 65535:
-        raise RequestError(f"--tcp {port}: a port is a number from 0 (any that is free) to 65535")
+        raise RequestError(f"{option} {port}: a port is a number from 0 (any that is free) to 65535")
     listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -77,5 +77,5 @@ def listen_tcp(port: int) -> socket.socket:
         listening.listen(_BACKLOG)
     except OSError as error:
         listening.close()
-        raise LinkError(f"127.0.0.1:{port}: can't listen: {error.strerror}; give another port with --tcp") from error
+        raise LinkError(f"127.0.0.1:{port}: can't listen: {error.strerror}; give another port with {option}") from error
     return listening

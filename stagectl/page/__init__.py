@@ -1,0 +1,1 @@
+"""The live page: a client of the service with a face, in a process of its own."""

@@ -1,0 +1,245 @@
+"""The page's door without a browser: links, cookie, Host, Origin, roles; and what it passes on to the service."""
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+
+import httpx
+import pytest
+import websockets
+
+from stagectl.page.admission import ENTRY, KEY_HEADER, Sessions
+from stagectl.service.access import Role
+from tests.service.pages import PageServer
+
+pytestmark = pytest.mark.real_time
+
+
+@pytest.fixture(scope="module")
+def page(daemon):
+    server = PageServer(daemon.socket, daemon.runs)
+    yield server
+    server.end()
+
+
+def heard(page, cookie, origin, host=None, count=1):
+    """Listen to the stream as a browser would, and return the first messages."""
+    headers = {"Cookie": cookie} if cookie else {}
+    if host:
+        headers["Host"] = host
+
+    async def listen():
+        uri = f"ws://127.0.0.1:{page.port}/v1/stream"
+        async with websockets.connect(uri, origin=origin, additional_headers=headers) as stream:
+            return [json.loads(await asyncio.wait_for(stream.recv(), 10.0)) for _ in range(count)]
+
+    return asyncio.run(listen())
+
+
+def cookie_of(client):
+    return "; ".join(f"{name}={value}" for name, value in client.cookies.items())
+
+
+def test_a_link_works_once_and_becomes_a_cookie_that_no_script_and_no_other_site_has(page):
+    link = page.link(Role.OPERATE)
+    with httpx.Client(trust_env=False) as browser:
+        assert browser.head(link).status_code == 401  # a look at the link doesn't use it up
+        first = browser.get(link)
+        assert first.status_code == 200
+        said = first.headers["set-cookie"]
+        assert all(part in said for part in ("HttpOnly", "SameSite=Strict", "Path=/"))
+        assert "Domain" not in said
+        assert browser.get(page.address).status_code == 200
+        assert browser.get(f"{page.address}/session").json() == {"role": "operate"}
+    with httpx.Client(trust_env=False) as thief:
+        assert thief.get(link).status_code == 401
+        assert thief.get(page.address).status_code == 401
+    assert page.link(Role.OPERATE) != link
+
+
+@pytest.mark.parametrize("place", ["/", "/session", "/v1/status", "/v1/runs", "/assets/page.js", "/runs/x/report"])
+def test_a_stranger_sees_nothing(page, place):
+    for cookie in ("", f"stagectl-page-{page.port}=", f"stagectl-page-{page.port}=guess", "=;;=", "a" * 4000):
+        answer = httpx.get(page.address + place, headers={"Cookie": cookie}, trust_env=False)
+        assert answer.status_code == 401
+        assert "works once" in answer.json()["message"]
+
+
+def test_a_wrong_host_or_origin_is_refused_whatever_the_cookie(page):
+    with page.browser(Role.OPERATE) as browser:
+        own = page.address
+        for host in (
+            "evil.example",
+            f"evil.example:{page.port}",
+            "127.0.0.1",
+            "127.0.0.1:1",
+            f"127.0.0.1.:{page.port}",
+        ):
+            assert browser.get("/v1/status", headers={"Host": host}).status_code == 403
+            assert browser.get(page.link(Role.OPERATE), headers={"Host": host}).status_code == 403
+        for origin in ("http://evil.example", "null", "http://127.0.0.1", f"https://127.0.0.1:{page.port}", own + "0"):
+            assert browser.post("/v1/stop", headers={"Origin": origin}).status_code == 403
+            assert browser.get("/v1/status", headers={"Origin": origin}).status_code == 403
+        assert browser.get("/v1/status", headers={"Sec-Fetch-Site": "same-site"}).status_code == 403
+        local = f"localhost:{page.port}"
+        assert browser.get("/v1/status", headers={"Host": local, "Origin": f"http://{local}"}).status_code == 200
+        assert browser.get("/v1/status", headers={"Host": local}).status_code == 403  # the other of our two names
+    with page.browser(Role.OPERATE) as browser:
+        del browser.headers["Origin"]
+        assert browser.get("/v1/status").status_code == 200
+        assert browser.post("/v1/stop").status_code == 403
+
+
+def test_the_stream_is_for_our_own_page_alone(page):
+    with page.browser(Role.OBSERVE) as browser:
+        cookie = cookie_of(browser)
+    story = heard(page, cookie, page.address)[0]
+    assert story["status"]["banner"].startswith("SOFTWARE RIG")
+    assert len(story["samples"]["columns"]) == 10
+    for wrong in (("", page.address), (cookie, None), (cookie, "http://evil.example"), (cookie, "null")):
+        with pytest.raises(websockets.InvalidStatus):
+            heard(page, *wrong)
+
+
+def test_an_observer_commands_nothing(page, daemon):
+    with page.browser(Role.OBSERVE) as browser:
+        assert browser.get("/v1/status").status_code == 200
+        bodies = {
+            "lease": {"holder": "x"},
+            "move": {"target_m": 0.0},
+            "home": {},
+            "arm": {},
+            "stop": None,
+            "record": {},
+        }
+        for name, body in bodies.items():
+            answer = browser.post(f"/v1/{name}", json=body)
+            assert answer.status_code == 403
+            assert "may only watch" in answer.json()["message"]
+        assert browser.put("/v1/jog", json={"velocity_m_per_s": 0.01}).status_code == 403
+        assert browser.delete("/v1/record").status_code == 403
+        assert browser.request("PATCH", "/v1/status").status_code == 403
+    assert daemon.client.lease_state() is None
+
+
+def test_an_operator_s_requests_are_passed_on_with_lease_and_key(page, idle):
+    with page.browser(Role.OPERATE) as browser:
+        refused = browser.post("/v1/home", json={})
+        assert refused.status_code == 423
+        taken = browser.post("/v1/lease", json={"holder": "page test", "duration_s": 5.0}).json()
+        assert idle.client.lease_state().holder == "page test"
+        headers = {"Stagectl-Lease": taken["token"], "Idempotency-Key": "page-1"}
+        first = browser.post("/v1/reread", json={}, headers=headers)
+        assert (first.status_code, first.json()["key"]) == (202, "page-1")
+        assert browser.get("/v1/commands/page-1?wait_s=2").json()["state"] == "done"
+        assert browser.delete("/v1/lease", headers=headers).status_code == 204
+        assert browser.post("/v1/move", content="{", headers={"Content-Type": "application/json"}).status_code == 422
+        assert browser.post("/v1/move", content="x" * 70_000).status_code == 413
+        for nowhere in ("/v1/../openapi.json", "/v1/lease/a/b", "/v1/%2e%2e/metrics", "/openapi.json"):
+            assert browser.get(nowhere).status_code == 404
+
+
+def test_pages_carry_a_policy_and_reports_come_from_the_runs_folder_only(page, daemon):
+    with page.browser(Role.OBSERVE) as browser:
+        answer = browser.get("/")
+        policy = answer.headers["content-security-policy"]
+        assert "script-src 'self'" in policy
+        assert "unsafe" not in policy
+        assert answer.headers["x-frame-options"] == "DENY"
+        assert "http://" not in answer.text
+        assert "https://" not in answer.text  # a stage PC has no internet
+        made = daemon.runs / "drawn-before"
+        made.mkdir(parents=True)
+        (made / "report.html").write_text("<b>drawn</b>")
+        report = browser.get("/runs/drawn-before/report")
+        assert report.text == "<b>drawn</b>"
+        assert report.headers["content-security-policy"].endswith("sandbox")
+        for nowhere in ("no-such-run", "..", "%2e%2e", "..%2fstate", "."):
+            assert browser.get(f"/runs/{nowhere}/report").status_code == 404
+        (made / "report.html").unlink()
+        broken = browser.get("/runs/drawn-before/report")
+        assert broken.status_code == 404
+        assert "no report" in broken.text
+        made.rmdir()
+
+
+def test_ten_pages_are_one_client_of_the_service(page):
+    """All get the very same messages of one stream; two streams would differ in their uptime at least."""
+    with page.browser(Role.OBSERVE) as browser:
+        cookie = cookie_of(browser)
+
+    async def ten():
+        uri = f"ws://127.0.0.1:{page.port}/v1/stream"
+        headers = {"Cookie": cookie}
+        streams = [await websockets.connect(uri, origin=page.address, additional_headers=headers) for _ in range(10)]
+        try:
+            stories = [json.loads(await stream.recv()) for stream in streams]
+            texts = [{await stream.recv() for _ in range(5)} for stream in streams]
+        finally:
+            for stream in streams:
+                await stream.close()
+        return stories, texts
+
+    stories, texts = asyncio.run(ten())
+    assert all(story["status"]["state"] for story in stories)
+    assert len(set.union(*texts)) < 15  # the same messages for all of them: about five, not fifty
+
+
+def test_without_a_service_the_page_says_so(tmp_path):
+    server = PageServer(tmp_path / "none", tmp_path)
+    try:
+        with server.browser(Role.OPERATE) as browser:
+            assert browser.get("/").status_code == 200
+            answer = browser.post("/v1/stop")
+            assert answer.status_code == 502
+            assert "is `stagectl serve` running?" in answer.json()["message"]
+            assert "doesn't answer" in heard(server, cookie_of(browser), server.address)[0]["lost"]
+    finally:
+        server.end()
+
+
+def test_the_oldest_of_too_many_browsers_goes_and_one_that_was_silent_for_half_a_day():
+    now_s = [0.0]
+    sessions = Sessions(clock_s=lambda: now_s[0])
+    values = [sessions.enter(sessions.link_token(Role.OBSERVE))[0] for _ in range(65)]
+    assert sessions.session(values[0]) is None
+    assert [sessions.session(value).role for value in values[1:]] == [Role.OBSERVE] * 64
+    assert sessions.enter(values[1]) is None  # a cookie is no link
+    now_s[0] += 11 * 3600.0
+    assert sessions.session(values[1]) is not None
+    now_s[0] += 2 * 3600.0
+    assert sessions.session(values[1]) is not None  # it was heard of two hours ago
+    assert sessions.session(values[2]) is None
+
+
+def test_a_stolen_cookie_commands_nothing(page, idle):
+    """A browser sends its cookies to every port of 127.0.0.1; the page's key goes nowhere else."""
+    with page.browser(Role.OPERATE) as browser, page.browser(Role.OPERATE) as other:
+        own = browser.headers[KEY_HEADER]
+        for key in ("", "guess", other.headers[KEY_HEADER], own[:-1]):
+            browser.headers[KEY_HEADER] = key
+            for method, place in (("POST", "lease"), ("POST", "stop"), ("PUT", "jog"), ("DELETE", "record")):
+                answer = browser.request(method, f"/v1/{place}", json={"holder": "thief"})
+                assert answer.status_code == 403
+                assert "key" in answer.json()["message"]
+    assert idle.client.lease_state() is None
+
+
+def test_the_command_shows_links_and_the_next_one_when_one_was_used(daemon):
+    command = [sys.executable, "-m", "stagectl.cli", "page", "--json", "--port", "0", "--socket", str(daemon.socket)]
+    showing = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        shown = [json.loads(showing.stdout.readline()) for _ in range(2)]
+        assert [one["role"] for one in shown] == ["operate", "observe"]
+        assert all(one["url"].startswith("http://127.0.0.1:") and ENTRY in one["url"] for one in shown)
+        assert httpx.get(shown[1]["url"], trust_env=False).status_code == 200
+        following = json.loads(showing.stdout.readline())
+        assert following["role"] == "observe"
+        assert following["url"] != shown[1]["url"]
+        showing.send_signal(signal.SIGINT)
+        assert showing.wait(20.0) == 130
+    finally:
+        showing.kill()
+        showing.communicate()

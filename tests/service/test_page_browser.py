@@ -1,0 +1,352 @@
+"""The page in a real Chromium: what an operator does, what an observer can't, and a page that vanishes mid-jog."""
+
+import functools
+import http.server
+import json
+import os
+import re
+import shutil
+import signal
+import threading
+import time
+
+import pytest
+
+from stagectl.service.access import Role
+from tests.service.daemon import REST_M_PER_S
+from tests.service.pages import PageServer
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+try:
+    from playwright.sync_api import expect, sync_playwright
+except ImportError:
+    pytest.skip("no playwright here: pip install -e '.[dev]'", allow_module_level=True)
+if CHROMIUM is None:
+    pytest.skip("no Chromium here: apt install chromium", allow_module_level=True)
+
+pytestmark = pytest.mark.real_time
+
+PHONE = {"width": 390, "height": 844}
+PATIENCE_MS = 60_000
+
+
+@pytest.fixture(scope="module")
+def page_server(daemon):
+    server = PageServer(daemon.socket, daemon.runs)
+    yield server
+    server.end()
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory):
+    """A browser that leaves the servo its processor: two are all that many a test host has."""
+    wrapper = tmp_path_factory.mktemp("browser") / "chromium"
+    processor = min(os.sched_getaffinity(0))
+    wrapper.write_text(f'#!/bin/sh\nexec nice -n 19 taskset -c {processor} {CHROMIUM} "$@"\n')
+    wrapper.chmod(0o755)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=str(wrapper), args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(chromium, page_server):
+    """Open the page for a role: a function; what a page complains of fails the test."""
+    complaints, contexts = [], []
+
+    def open_page(role, **how):
+        context = chromium.new_context(**how)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("console", lambda said: complaints.append(said.text) if "Content Security" in said.text else None)
+        page.goto(page_server.link(role))
+        page.wait_for_url("**/")
+        expect(page.locator("#state")).not_to_have_attribute("data-state", "lost", timeout=PATIENCE_MS)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def state_is(page, *states):
+    expect(page.locator("#state")).to_have_attribute("data-state", re.compile("|".join(states)), timeout=PATIENCE_MS)
+
+
+def idle_without_home(page):
+    """Tell whether the stage has to be homed; a test before may have done it."""
+    state_is(page, "idle")
+    return page.locator("#doing").get_attribute("data-homed") == "false"
+
+
+def armed_page(opened, **how):
+    page = opened(Role.OPERATE, **how)
+    page.click("#take")
+    if idle_without_home(page):
+        page.click("#home")  # ends without power on a stage that has no micro
+    page.click("#arm")
+    state_is(page, "armed")
+    return page
+
+
+def press(page, button):
+    box = page.locator(button).bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+
+
+def velocity_m_per_s(daemon):
+    return abs(daemon.plant["macro_velocity_m_per_s"])
+
+
+def test_an_operator_homes_moves_jogs_while_held_and_stops(idle, opened):
+    page = armed_page(opened)
+    page.fill("#target", "10")
+    page.click("#move")
+    idle.until(lambda: abs(idle.plant["macro_position_m"]) > 0.0, "motion")
+    expect(page.locator("#command-text")).to_have_text("move: done", timeout=PATIENCE_MS)
+    state_is(page, "armed")
+    assert idle.client.status().positions.end_position_m == pytest.approx(0.01, abs=1e-4)
+    press(page, "#jog-right")
+    state_is(page, "moving")
+    time.sleep(0.5)
+    page.mouse.up()
+    state_is(page, "armed")  # it holds where it was let go of
+    assert velocity_m_per_s(idle) < REST_M_PER_S
+    assert idle.client.status().positions.end_position_m > 0.0105
+    page.click("#stop")
+    state_is(page, "idle")
+    page.click("#take")  # given back
+    expect(page.locator("#lease")).to_have_text("nobody operates")
+
+
+def test_a_page_that_vanishes_in_the_middle_of_a_jog_stops_the_stage(idle, opened, chromium):
+    page = armed_page(opened)
+    press(page, "#jog-left")
+    idle.until(lambda: velocity_m_per_s(idle) > REST_M_PER_S, "motion")
+    processes = chromium.new_browser_cdp_session().send("SystemInfo.getProcessInfo")["processInfo"]
+    for process in processes:
+        if process["type"] == "renderer":
+            os.kill(process["id"], signal.SIGKILL)  # no handler of ours runs
+    idle.until(lambda: idle.client.status().state == "armed", "the jog's end")
+    assert idle.client.status().lease is not None
+    idle.state_is("fault")
+    assert idle.client.status().fault.kind == "LEASE"
+    assert velocity_m_per_s(idle) < REST_M_PER_S
+
+
+def test_leaving_the_page_gives_the_lease_back(idle, opened):
+    page = armed_page(opened)
+    page.goto("about:blank")
+    idle.state_is("idle")
+    assert idle.client.status().fault is None
+    idle.until(lambda: idle.client.lease_state() is None, "a free lease")
+
+
+def test_stop_is_in_sight_at_phone_width_wherever_one_scrolls(idle, opened):
+    page = armed_page(opened, viewport=PHONE, has_touch=True, is_mobile=True)
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    for far in (0.0, 0.5, 1.0):
+        page.evaluate("share => scrollTo(0, share * document.body.scrollHeight)", far)
+        box = page.locator("#stop").bounding_box()
+        assert box["y"] >= 0.0
+        assert box["y"] + box["height"] <= PHONE["height"]
+        assert box["height"] >= 44.0
+        hit = "([x, y]) => document.elementFromPoint(x, y).id"
+        assert page.evaluate(hit, [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]) == "stop"
+    page.tap("#stop")
+    state_is(page, "idle")
+
+
+def test_an_observer_s_page_shows_and_commands_nothing(idle, opened):
+    page = opened(Role.OBSERVE)
+    expect(page.locator("#watching")).to_be_visible()
+    expect(page.locator("#commands")).to_be_hidden()
+    expect(page.locator("#stop")).to_be_disabled()
+    code = page.evaluate("""async () => (await fetch('/v1/lease', {method: 'POST', body: '{"holder": "x"}',
+        headers: {'Content-Type': 'application/json'}})).status""")
+    assert code == 403
+    assert idle.client.lease_state() is None
+    expect(page.locator("#end")).not_to_have_text("–")
+    assert page.locator("#plots canvas").count() >= 3
+
+
+def test_hold_and_zoom_keep_the_picture_and_let_it_go(idle, opened):
+    page = opened(Role.OBSERVE)
+    chip = page.locator("#trigger-state")
+    expect(chip).to_have_text("rolling")
+    page.click("#zoom-in")
+    expect(chip).to_have_text("held")
+    page.click("#hold")
+    expect(chip).to_have_text("rolling")
+    page.select_option("#trigger", "error")
+    expect(page.locator("#level")).to_be_visible()
+    page.fill("#level", "1e9")
+    page.locator("#level").blur()
+    expect(chip).to_have_text("waits for the trigger")
+
+
+MARKUP = "<img src=x onerror='document.title=1'>"
+
+
+def test_names_and_reports_from_outside_are_text_and_run_nothing(idle, opened):
+    """A run's folder, its note and its report, and a lease's holder: all of it may be anybody's words."""
+    folder = idle.runs / "hostile<b onclick=1>&quot;"
+    folder.mkdir(parents=True)
+    (folder / "manifest.json").write_text(json.dumps({"text": MARKUP, "profile": {"name": MARKUP}}))
+    reported = idle.runs / "reported"
+    reported.mkdir()
+    (reported / "report.html").write_text(
+        "<title>as it was</title><p>drawn</p><script>document.title='run'</script>"
+        "<img src=x onerror=\"document.title='run'\"><form action=/v1/stop method=post><button>go</button></form>"
+    )
+    try:
+        page = opened(Role.OBSERVE)
+        with idle.client.lease(MARKUP):
+            expect(page.locator("#lease")).to_have_text(f"{MARKUP} operates", timeout=PATIENCE_MS)
+            page.click("#runs-refresh")
+            expect(page.locator("#runs")).to_contain_text(folder.name)
+            assert page.locator("main img, main [onclick]").count() == 0
+            assert page.title() != "1"
+        with page.context.expect_page() as shown:
+            page.click("text=reported")
+        report = shown.value
+        expect(report.locator("p")).to_have_text("drawn")
+        assert report.title() == "as it was"
+        assert report.evaluate("origin") == "null"  # a page of nobody: neither cookie nor key
+        report.click("button")
+        assert report.url.endswith("/report")
+    finally:
+        shutil.rmtree(folder)
+        shutil.rmtree(reported)
+
+
+def test_another_site_in_the_same_browser_gets_nothing(idle, opened, tmp_path):
+    """A page on another port of 127.0.0.1 is the same site to cookies; it is not ours for all that."""
+    page = opened(Role.OPERATE)
+    (tmp_path / "index.html").write_text("<title>evil</title>")
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as evil:
+        threading.Thread(target=evil.serve_forever, daemon=True).start()
+        target = page.url.rstrip("/")
+        other = page.context.new_page()
+        other.goto(f"http://127.0.0.1:{evil.server_address[1]}/")
+        found = other.evaluate(FROM_ELSEWHERE, target)
+        evil.shutdown()
+    assert found == {"read": "refused", "posted": "refused", "stream": "closed", "frame": "blocked", "key": None}
+    assert idle.client.lease_state() is None
+    assert all("stop" not in entry.event for entry in idle.client.log(limit=3))
+
+
+FROM_ELSEWHERE = """async (target) => {
+    const read = await fetch(target + '/v1/status', {credentials: 'include'}).then(() => 'read', () => 'refused');
+    const posted = await fetch(target + '/v1/stop', {method: 'POST', mode: 'no-cors', credentials: 'include'})
+        .then(() => 'sent', () => 'refused');
+    const stream = await new Promise((resolve) => {
+        const socket = new WebSocket(target.replace('http', 'ws') + '/v1/stream');
+        socket.onmessage = () => resolve('heard');
+        socket.onerror = () => resolve('closed');
+    });
+    const frame = await new Promise((resolve) => {
+        const made = document.createElement('iframe');
+        made.onload = () => {
+            try { resolve(made.contentDocument ? 'empty' : 'blocked'); } catch { resolve('blocked'); }
+        };
+        made.src = target + '/';
+        document.body.append(made);
+    });
+    return {read, posted, stream, frame, key: localStorage.getItem('stagectl-page-key')};
+}"""
+
+
+FIRST = """async ([rows, from, kind, level]) => {
+    const { firstTrigger } = await import('/assets/trigger.js');
+    return firstTrigger(rows, from, kind, level);
+}"""
+
+
+def rows_of(setpoints=(), errors=(), contacts=()):
+    count = max(len(setpoints), len(errors), len(contacts))
+    column = lambda values: list(values) or [0.0] * count  # noqa: E731
+    triples = zip(column(setpoints), column(errors), column(contacts), strict=True)
+    return [[0.01 * i, 0.0, 0.0, s, e, 0.0, 0.0, 0.0, c, 0] for i, (s, e, c) in enumerate(triples)]
+
+
+READOUT = """async ([rows, a, b]) => {
+    const { readout } = await import('/assets/readout.js');
+    return Object.fromEntries(readout(rows, a, b).map((line) => [line.name, [line.t_s, line.values[1]]]));
+}"""
+
+
+def test_cursors_say_difference_slope_and_statistics_of_what_is_between(opened):
+    page = opened(Role.OBSERVE)
+    rows = rows_of(errors=[9e-6, 1e-6, 2e-6, None, 3e-6, -50e-6])
+    found = page.evaluate(READOUT, [rows, 0.0096, 0.043])
+    assert found["A"] == [0.01, pytest.approx(1.0)]
+    assert found["B"] == [0.04, pytest.approx(3.0)]
+    assert found["B − A"] == [pytest.approx(0.03), pytest.approx(2.0)]
+    assert found["per second"][1] == pytest.approx(2.0 / 0.03)
+    assert found["mean"][1] == pytest.approx(2.0)
+    assert found["rms about mean"][1] == pytest.approx((2.0 / 3.0) ** 0.5)
+    assert found["peak to peak"][1] == pytest.approx(2.0)
+    assert list(page.evaluate(READOUT, [rows, 0.02, None])) == ["A"]
+    page.click("#cursors-on")
+    plot = page.locator("#plots .u-over").first
+    for x in (50, 150):
+        plot.click(position={"x": x, "y": 20})
+    expect(page.locator("#cursors")).to_contain_text("peak to peak")
+
+
+WHY_NOT = """async ([id, situation]) => (await import('/assets/permit.js')).whyNot(id, situation)"""
+
+
+def test_a_button_that_can_t_be_used_says_why(idle, opened):
+    page = opened(Role.OPERATE)
+    state_is(page, "idle")
+    page.locator("#move").click(force=True)
+    expect(page.locator("#refusal")).to_have_text("Move to: take the lease first")
+    expect(page.locator("#move")).to_be_disabled()
+    with idle.client.lease("somebody else"):
+        expect(page.locator("#lease")).to_have_text("somebody else operates", timeout=PATIENCE_MS)
+        page.locator("#take").click(force=True)
+        expect(page.locator("#refusal")).to_contain_text("somebody else operates, and one does at a time")
+    status = {"state": "moving", "homed": True, "lease": None, "recording": None}
+    held = {"status": status, "held": True, "mayOperate": True, "jogging": False}
+    assert "stop it" in page.evaluate(WHY_NOT, ["move", held])
+    assert page.evaluate(WHY_NOT, ["jog-left", held | {"jogging": True}]) == ""
+    assert page.evaluate(WHY_NOT, ["move", held | {"status": status | {"state": "armed"}}]) == ""
+    not_homed = status | {"state": "armed", "homed": False}
+    assert page.evaluate(WHY_NOT, ["move", held | {"status": not_homed}]) == "home first"
+    assert "doesn't answer" in page.evaluate(WHY_NOT, ["move", held | {"status": None}])
+
+
+def test_a_stop_that_nobody_hears_says_so(idle, opened):
+    page = opened(Role.OPERATE)
+    page.route("**/v1/stop", lambda route: route.abort())
+    page.click("#stop")
+    expect(page.locator("#alarm")).to_contain_text("Use the emergency stop")
+    page.unroute("**/v1/stop")
+    expect(page.locator("#alarm")).to_be_hidden()  # said again, and heard
+
+
+def test_a_trigger_fires_at_the_first_rise_contact_or_reversal(opened):
+    page = opened(Role.OBSERVE)
+
+    def first(rows, kind, level=0.0, begin=0):
+        return page.evaluate(FIRST, [rows, begin, kind, level])
+
+    errors = rows_of(errors=[0.0, 4e-6, -6e-6, -7e-6, 1e-6, 5e-6])
+    assert first(errors, "error", 5e-6) == 2
+    assert first(errors, "error", 5e-6, begin=3) == 5
+    assert first(errors, "error", 8e-6) == -1
+    assert first(rows_of(errors=[None, 9e-6, 9e-6]), "error", 5e-6) == -1  # no rise was seen
+    assert first(rows_of(contacts=[0.2, -0.9, -1.0, 2.0]), "contact", 1.0) == 2
+    there_and_back = rows_of(setpoints=[0.0, 1e-3, 2e-3, 2e-3, 2e-3, 1e-3, 0.0])
+    assert first(there_and_back, "reversal") == 5  # over the rest between
+    assert first(rows_of(setpoints=[0.0, 0.0, 1e-3, 2e-3]), "reversal") == -1  # a beginning is no reversal
+    assert first(rows_of(setpoints=[1e-3, 2e-3, None, 2e-3, 1e-3]), "reversal") == -1
+    assert first(there_and_back, "none") == -1
