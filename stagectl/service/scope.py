@@ -22,7 +22,10 @@ COLUMNS = (
     "contact_force_estimate_n",
     "phase",
 )
-"""`t_s` is the servo's clock; `error_m` is the greatest of the rows that a sample stands for, with its sign."""
+"""`t_s` is the servo's clock; `error_m` is the greatest of the rows that a sample stands for, with its sign.
+
+Rows whose line came late have no error: position and set-point are of different instants there.
+"""
 
 
 class Samples(NamedTuple):
@@ -52,8 +55,10 @@ class Scope:
         if whole == 0:
             return
         taken = rows[: whole : self._every]
-        errors_m = (rows["end_position_m"][:whole] - rows["setpoint_position_m"][:whole]).reshape(-1, self._every)
-        worst = np.argmax(np.abs(np.nan_to_num(errors_m)), axis=1)
+        fresh = (rows["sequence"] == rows["cycle"]) & (rows["samples_new"] > 0)
+        errors_m = np.where(fresh, rows["end_position_m"] - rows["setpoint_position_m"], np.nan)[:whole]
+        errors_m = errors_m.reshape(-1, self._every)
+        worst = np.argmax(np.where(np.isnan(errors_m), -1.0, np.abs(errors_m)), axis=1)
         columns = (
             taken["t_ns"] * 1e-9,
             taken["end_position_m"],

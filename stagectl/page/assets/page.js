@@ -41,6 +41,7 @@ function showLost(text) {
     byId('state').dataset.state = 'lost';
     write('state', 'no connection');
     operator.lost();
+    write('doing', '');
   }
 }
 

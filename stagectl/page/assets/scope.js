@@ -154,7 +154,7 @@ export class Scope {
       axes: [{ ...axis, size: last ? 30 : 6, values: (plot, marks) => marks.map((mark) => (last ? `${+mark.toFixed(4)} s` : '')) },
         { ...axis, size: 64, label: one.title, labelSize: 16, labelFont: '11px system-ui', labelGap: 0 }],
       series: [{ label: 't, s', value: (plot, value) => (value === null ? '–' : value.toFixed(2)) },
-        ...one.lines.map((each) => ({ label: each.label, stroke: colour(each.colour), width: 1.4, dash: each.dash,
+        ...one.lines.map((each) => ({ label: each.label, stroke: colour(each.colour), width: 1.4, dash: each.dash, spanGaps: each.column === COLUMN.error_m,
           points: { show: false }, value: (plot, value) => (value == null ? '–' : value.toFixed(each.scale === 1e3 ? 4 : 3)) }))],
       hooks: {
         setSelect: [(plot) => this.select(plot)],
