@@ -270,11 +270,16 @@ def _browser(url: str) -> Iterator[None]:
         try:
             page = browser.new_page(viewport={"width": 1400, "height": 1000})
             page.goto(url)
-            shows = "document.querySelector('#cycles').textContent.replaceAll(',', '')"
-            page.wait_for_function(f"Number({shows}) > 0", timeout=1e3 * _PATIENCE_S)
-            before = int(page.evaluate(shows))
+
+            def shown_count() -> int:
+                return int(
+                    page.locator("#cycles").inner_text(timeout=1e3 * _PATIENCE_S).replace(",", "").strip("–") or 0
+                )
+
+            _await(lambda: shown_count() > 0, "a Chromium that shows the stage")
+            before = shown_count()
             yield
-            page.wait_for_function(f"Number({shows}) > {before}", timeout=1e3 * _PATIENCE_S)
+            _await(lambda: shown_count() > before, "a Chromium that still shows it")
         finally:
             browser.close()
 
