@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +39,7 @@ SETTLE_S = 2.0
 LEVEL = 0.05
 CLIENTS_COUNT = 9
 _PATIENCE_S = 60.0
+_COMPILE_S = 300.0  # a cold cache on a slow host
 _TRIES_COUNT = 3
 
 
@@ -62,7 +63,7 @@ def chromium_path() -> str | None:
     return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
-def figures(*, full: bool, say) -> Iterator[Figure]:
+def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
     """Measure the rows of the page."""
     lacking = _lacking()
     if lacking:
@@ -149,9 +150,14 @@ class _Stage:
     def __init__(self, folder: Path):
         self.folder = folder
         self.daemon = Daemon(folder)
-        self.daemon.state_is("idle")
+        _await(self._is_idle, "a stage that is connected", _COMPILE_S)
         self._lease = contextlib.ExitStack()
         self.hold()
+
+    def _is_idle(self) -> bool:
+        with contextlib.suppress(StagectlError):
+            return self.daemon.client.status().state == "idle"
+        return False
 
     def close(self) -> None:
         """End the service."""
@@ -284,9 +290,9 @@ def _browser(url: str) -> Iterator[None]:
             browser.close()
 
 
-def _await(done, what: str) -> None:
-    give_up_s = time.monotonic() + _PATIENCE_S
+def _await(done: Callable[[], bool], what: str, patience_s: float = _PATIENCE_S) -> None:
+    give_up_s = time.monotonic() + patience_s
     while not done():
         if time.monotonic() > give_up_s:
-            raise TimeoutError(f"{what}: not within {_PATIENCE_S:g} s")
+            raise TimeoutError(f"{what}: not within {patience_s:g} s")
         time.sleep(0.05)
