@@ -128,15 +128,25 @@ _MISFIT_RATIO = 3.0  # of mean square residual to what noise explains
 _LEAVING_RATIO = 0.4  # of a hold's peak, below which the joint may have let go
 _SURE_SDS = 5.0  # that a force is beyond what the doubts explain by
 _RATIO_SHARE = 5e-4
+_SMALL_FORCE_N = 0.01  # an offset doubted by no more can wait for the gap until both edges are known: 1 um at 10 N/mm
 
 
 def believed_doubts(profile: "Profile") -> Doubts:
-    """Return what a profile leaves open: the micro's mass, or the force constant by as much, scaling every force."""
+    """Return what a profile leaves open: the micro's mass, or the force constant by as much, scaling every force.
+
+    And where the spring between the stages stands at its middle: zeros are laid by the edges, and 4 um beside it are
+    2 mN of offset, which went into both edges (0.2 um).
+    """
     if profile.micro is None:
         return Doubts()
     micro = profile.micro
     ratio = micro.mass_sd_kg / micro.mass_kg
-    return Doubts(micro.mass_sd_kg, ratio * micro.spring_n_per_m, ratio * micro.damping_n_s_per_m)
+    force_n = 0.0
+    if profile.backlash is not None:
+        force_n = min(micro.spring_n_per_m * profile.backlash.width_sd_m, _SMALL_FORCE_N)
+    return Doubts(
+        micro.mass_sd_kg, ratio * micro.spring_n_per_m, ratio * micro.damping_n_s_per_m, force_n=force_n
+    )
 
 
 def init(
@@ -185,7 +195,8 @@ def init(
         doubts = believed_doubts(profile)
     regression.prepare(b, doubts.variances)
     b["gap_margin_m"] = np.inf
-    if doubts.force_n > 0.0 and profile.backlash is not None:  # an offset and an edge differ in the gap alone
+    # A large offset and an edge differ in the gap alone.
+    if doubts.force_n > _SMALL_FORCE_N and profile.backlash is not None:
         b["gap_margin_m"] = 3.0 * profile.backlash.width_sd_m
     b["looks_for_knee"] = float(doubts.knee_n_m > 0.0)
     b["looks_for_hysteresis"] = float(doubts.hysteresis_n_per_m > 0.0)
