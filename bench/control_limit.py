@@ -13,7 +13,6 @@ import numpy as np
 
 from bench.figure import Bar, Figure, judged
 from bench.following import peak, rms
-from bench.variants import at_the_limit
 from sim_backend.machine import Machine, load_machine
 from stagectl import batch, tick, trajectory
 from stagectl.laws.reference import gap_centre
@@ -80,7 +79,7 @@ def with_tables(described: Any, **tables: dict[str, Any]) -> Any:
 
 def stage(**control: float | str) -> Profile:
     """Return the profile with one cycle from sample to force, and other values of its [control] where given."""
-    return with_tables(at_the_limit(load_profile(STAGE)), cycle={"actuation_delay_s": ONE_CYCLE_S}, control=control)
+    return with_tables(load_profile(STAGE), cycle={"actuation_delay_s": ONE_CYCLE_S}, control=control)
 
 
 def weak(profile: Profile) -> Profile:
@@ -237,7 +236,7 @@ def _margins() -> Iterator[Figure]:
     phase = np.degrees(min(one.phase_margin_rad for one in found))
     gain = min(one.gain_margin_ratio for one in found)
     yield judged(CROSSOVER, found[0].crossover_hz, reason=f"phase margin {phase:.0f} deg, gain margin {gain:.2f}")
-    shipped = at_the_limit(load_profile(STAGE))
+    shipped = load_profile(STAGE)
     loop = linearise(shipped, "dsmc", machine_body(machine(shipped)), GAP, ceiling)
     delay_us = 1e6 * shipped.cycle.actuation_delay_s
     yield judged(AS_SHIPPED, margins(loop).sensitivity_peak_ratio, reason=f"{delay_us:.0f} us from sample to force")

@@ -144,9 +144,7 @@ def believed_doubts(profile: "Profile") -> Doubts:
     force_n = 0.0
     if profile.backlash is not None:
         force_n = min(micro.spring_n_per_m * profile.backlash.width_sd_m, _SMALL_FORCE_N)
-    return Doubts(
-        micro.mass_sd_kg, ratio * micro.spring_n_per_m, ratio * micro.damping_n_s_per_m, force_n=force_n
-    )
+    return Doubts(micro.mass_sd_kg, ratio * micro.spring_n_per_m, ratio * micro.damping_n_s_per_m, force_n=force_n)
 
 
 def init(
