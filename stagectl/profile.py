@@ -309,6 +309,9 @@ class Control(Table):
     adaptive_gain_ceiling_ratio: Annotated[float, within(0.0, 10.0)] = 0.5
     macro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 5.0
     micro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 0.2
+    notch_frequency_hz: Annotated[float, within(0.0, 1e4)] = 0.0  # of dsmc; 0 = none
+    notch_damping_ratio: Annotated[float, within(0.01, 2.0)] = 0.3  # how wide
+    notch_depth_ratio: Annotated[float, within(0.0, 1.0)] = 0.1  # what is left in the middle
 
     @model_validator(mode="after")
     def _check_law(self) -> "Control":
@@ -566,6 +569,13 @@ class Profile(Document):
             value = getattr(self.control, key)
             limit = f"must be at most a fifth of cycle.rate_hz, {fastest_hz:g} Hz"
             problems.append(problem_if(not value <= fastest_hz, f"control.{key}", value, limit, "lower it"))
+        notch_hz, limit = (
+            self.control.notch_frequency_hz,
+            f"must be below half of cycle.rate_hz, {fastest_hz * 2.5:g} Hz",
+        )
+        problems.append(
+            problem_if(not notch_hz < 2.5 * fastest_hz, "control.notch_frequency_hz", notch_hz, limit, "lower it")
+        )
         return problems
 
 
