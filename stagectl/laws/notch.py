@@ -47,6 +47,8 @@ def init(law: np.ndarray, profile: "Profile") -> None:
 def passed(law: Record, asked_n: float) -> float:
     """Return what the notch lets through of what is asked, and remember it."""
     if law.has_notch == 0.0:
+        law.notch_first_n = 0.0  # a state that stayed what it is would be a pole on the unit circle
+        law.notch_second_n = 0.0
         return asked_n
     out_n = law.notch_new[0] * asked_n + law.notch_first_n
     law.notch_first_n = law.notch_new[1] * asked_n - law.notch_old[0] * out_n + law.notch_second_n
