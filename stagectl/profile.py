@@ -309,7 +309,7 @@ class Control(Table):
     adaptive_gain_ceiling_ratio: Annotated[float, within(0.0, 10.0)] = 0.5
     macro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 5.0
     micro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 0.2
-    notch_frequency_hz: Annotated[float, within(0.0, 1e4)] = 0.0  # of dsmc; 0 = none
+    notch_frequency_hz: Annotated[float, within(0.0, 1e4)] = 0.0  # of the observer; 0 = none
     notch_damping_ratio: Annotated[float, within(0.01, 2.0)] = 0.3  # how wide
     notch_depth_ratio: Annotated[float, within(0.0, 1.0)] = 0.1  # what is left in the middle
 

@@ -8,8 +8,7 @@ Micro, adaptive integral sliding mode (32)-(40):
     Omega' = (alpha k / r) s^2 - sigma (Omega - Omega_0), bounded, frozen in saturation   (40) corrected, E14
 
 with eta >= 2 sqrt(gamma) (E16). Known forces are those of the believed machine, predicted to the instant the
-command acts: spring, contact (its feed-forward), effects, and the observer's unknown force. What comes back from the
-sensor passes a notch where the profile has one (`stagectl.laws.notch`). Macro: state feedback
+command acts: spring, contact (its feed-forward), effects, and the observer's unknown force. Macro: state feedback
 on the centre of the gap (for (21), E11) with the micro's reaction decoupled (26), static with current drives.
 Pure; knows no bus and no clock.
 """
@@ -20,7 +19,6 @@ import numpy as np
 
 from stagectl import plant
 from stagectl.compiled import compiled
-from stagectl.laws import notch
 from stagectl.laws.reference import between, felt_after_s, gap_centre, precise_current_loop_s
 from stagectl.signals import Record
 
@@ -55,11 +53,10 @@ LAW = np.dtype(
         ("bump_n", "f8"),
         ("last_force_n", "f8"),
         ("started", "f8"),
-        *notch.FIELDS,
     ]
 )
 
-LINEAR_STATES = ("error_integral_m_s", *notch.LINEAR_STATES)
+LINEAR_STATES = ("error_integral_m_s",)
 """What a cycle leaves to the next about e = 0; the adaptive gain counts there as a parameter (s = 0)."""
 
 _PARK_BANDWIDTH_HZ = 15.0
@@ -94,7 +91,6 @@ def init(profile: "Profile") -> np.ndarray:
     law["park_stiffness_per_s2"] = w * w
     law["park_damping_per_s"] = 2.0 * w
     law["bump_decay_ratio"] = np.exp(-1.0 / (profile.cycle.rate_hz * _BUMP_S))
-    notch.init(law, profile)
     return law
 
 
@@ -132,6 +128,7 @@ def precision(
     dt_s: float,
 ) -> float:
     """Return the force of the axis that carries the end, N, within what its motor makes at its limits."""
+    known_n += disturbance_n
     felt_s = felt_after_s(precise_current_loop_s(q), dt_s)
     acceleration = later.acceleration_m_per_s2 + felt_s * later.jerk_m_per_s3
     e = ahead.end_position_m - later.position_m
@@ -149,15 +146,12 @@ def precision(
     if law.parked != 0.0:
         relative = ahead.end_position_m - ahead.macro_position_m + gap_centre(q) - later.relative_position_m
         relative_rate = ahead.end_velocity_m_per_s - ahead.macro_velocity_m_per_s - later.relative_velocity_m_per_s
-        back = -law.park_stiffness_per_s2 * relative - law.park_damping_per_s * relative_rate
+        wanted = acceleration - law.park_stiffness_per_s2 * relative - law.park_damping_per_s * relative_rate
     else:
         gain = law.sliding_gain_per_s * (1.0 + law.adaptive_gain_ratio)
         y = integrand(e, law.phi_m)
-        back = -law.eta_per_s * de - law.gamma_per_s2 * y - gain * s
-    back_n = mass_kg * back - disturbance_n
-    if law.has_notch != 0.0 and (law.started == 0.0 or was_parked != law.parked):
-        notch.settle(law, back_n)
-    free_n = mass_kg * acceleration - known_n + notch.passed(law, back_n)
+        wanted = acceleration - law.eta_per_s * de - law.gamma_per_s2 * y - gain * s
+    free_n = mass_kg * wanted - known_n
     if law.started != 0.0 and was_parked != law.parked:
         law.bump_n = law.last_force_n - free_n
     law.started = 1.0
