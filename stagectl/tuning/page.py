@@ -88,7 +88,7 @@ def _rules(tuned: Tuned) -> list[str]:
     ]
     if tuned.values.get("notch_frequency_hz", 0.0) > 0.0:
         said.append(
-            "The notch is in what the observer learns from the sensor, not in the command. Of several widths and depths "
-            "it is the one that leaves the greatest bandwidth, wherever within its bounds the mode is."
+            "The notch is in what the observer learns from the sensor, not in the command. Of several widths and "
+            "depths it is the one that leaves the greatest bandwidth, wherever within its bounds the mode is."
         )
     return said
