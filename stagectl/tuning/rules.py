@@ -46,6 +46,7 @@ _OBSERVER_RATIO = 0.67  # of the bandwidth: where the poles of a Kalman filter o
 _SPAN = (1e-2, 1e2)  # of the profile's own number, searched
 _GRID_COUNT = 13
 _BISECTIONS = 7
+_USUAL_SENSITIVITY = 2.0
 _SLACK = 1.002  # of a limit that a search ends at
 
 
@@ -53,7 +54,7 @@ _SLACK = 1.002  # of a limit that a search ends at
 class Asked:
     """What gains have to keep; `bandwidth_hz` None = as much as the margins allow."""
 
-    max_sensitivity: float = 2.0
+    max_sensitivity: float = _USUAL_SENSITIVITY
     delay_margin_s: float = 0.8e-3
     bandwidth_hz: float | None = None
     mode: Mode | None = None
@@ -120,7 +121,9 @@ def tuned(
     before = assessed(profile, law, mode)
     key = _key(profile, law)
     say("searching", 0.2)
-    value = _searched(profile, law, key, asked)
+    # The mode may cost margin, and that is no reason to be faster: without it the loop keeps to the usual one.
+    bare = asked if mode is None else replace(asked, max_sensitivity=min(asked.max_sensitivity, _USUAL_SENSITIVITY))
+    value = _searched(profile, law, key, bare)
     notch: dict[str, float] = {}
     if mode is not None:
         say("fitting the notch", 0.5)
