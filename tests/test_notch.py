@@ -62,22 +62,22 @@ def test_a_notch_at_half_the_rate_is_refused(oled_profile):
 
 
 def test_a_mode_rings_without_its_notch_and_holds_with_it():
-    """Against the motor at 200 Hz, -10 % and 1 %: on the linear loop at every corner, then on the machine."""
-    bare, mode = limit.stage(), Mode(200.0)
+    """Against the motor at 120 Hz, -10 % and 1 %: on the linear loop at its corners, then on the machine."""
+    bare, mode = limit.stage(), Mode(120.0)
     body = machine_body(limit.machine(bare))
-    assert modes.worst_sensitivity(linearise(bare, "dsmc", body), mode, 3) > 5.0
+    assert math.isinf(modes.worst_sensitivity(linearise(bare, "dsmc", body), mode, 3))
     found = tuned(bare, "dsmc", Asked(max_sensitivity=2.5, mode=mode))
     profile = limit.stage(**found.values)
     loop = linearise(profile, "dsmc", body, GAP, profile.control.adaptive_gain_ceiling_ratio)
     assert modes.worst_sensitivity(loop, mode) <= 2.6
-    row = modes.effect(200.0, 0.1, 0.01)
     one = limit.machine(profile)
-    ringing = one.model_copy(update={"effects": (*one.effects, row)})
-    held = {}
-    for name, controlled in (("bare", bare), ("notched", profile)):
-        held[name] = rms(limit.run(controlled, ringing, np.zeros(2000, SETPOINT), 1).error_m)
+    ringing = one.model_copy(update={"effects": (*one.effects, modes.effect(120.0, 0.1, 0.01))})
+    held = {
+        name: rms(limit.run(controlled, ringing, np.zeros(2000, SETPOINT), 1).error_m)
+        for name, controlled in (("bare", bare), ("notched", profile))
+    }
     assert held["notched"] < 10e-9
-    assert held["bare"] > 3.0 * held["notched"]
+    assert held["bare"] > 100e-9
 
 
 def test_the_mode_has_the_residue_that_it_is_given():
