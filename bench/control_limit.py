@@ -13,7 +13,6 @@ import numpy as np
 
 from bench.figure import Bar, Figure, judged
 from bench.following import peak, rms
-from bench.variants import at_the_limit
 from sim_backend.machine import Machine, load_machine
 from stagectl import batch, tick, trajectory
 from stagectl.laws.reference import gap_centre
@@ -45,10 +44,6 @@ DELAY_MARGIN = Bar("control, delay margin, least of the same", "ms", 0.8, at_lea
 MASS = Bar("control, micro's mass 10 % up and down, gap and contact: largest pole", "1", 1.0)
 CROSSOVER = Bar("control, crossover in the gap", "Hz")
 AS_SHIPPED = Bar("control, Ms at the profile's own delay", "1")
-COARSE_HOLD = Bar("control, torque step 0.18 N: hold, rms", "nm")
-COARSE_PEAK = Bar("control, torque step 0.18 N, contact-free, calibrated: peak", "nm")
-JITTER = Bar("control, sample jitter {} us rms, contact-free, calibrated: peak", "nm")
-CYCLIC = Bar("control, cyclic error 2 nm, contact-free, calibrated: peak", "nm")
 
 Say = Callable[[str], None]
 _REST_S = 1.0
@@ -80,7 +75,7 @@ def with_tables(described: Any, **tables: dict[str, Any]) -> Any:
 
 def stage(**control: float | str) -> Profile:
     """Return the profile with one cycle from sample to force, and other values of its [control] where given."""
-    return with_tables(at_the_limit(load_profile(STAGE)), cycle={"actuation_delay_s": ONE_CYCLE_S}, control=control)
+    return with_tables(load_profile(STAGE), cycle={"actuation_delay_s": ONE_CYCLE_S}, control=control)
 
 
 def weak(profile: Profile) -> Profile:
@@ -237,7 +232,7 @@ def _margins() -> Iterator[Figure]:
     phase = np.degrees(min(one.phase_margin_rad for one in found))
     gain = min(one.gain_margin_ratio for one in found)
     yield judged(CROSSOVER, found[0].crossover_hz, reason=f"phase margin {phase:.0f} deg, gain margin {gain:.2f}")
-    shipped = at_the_limit(load_profile(STAGE))
+    shipped = load_profile(STAGE)
     loop = linearise(shipped, "dsmc", machine_body(machine(shipped)), GAP, ceiling)
     delay_us = 1e6 * shipped.cycle.actuation_delay_s
     yield judged(AS_SHIPPED, margins(loop).sensitivity_peak_ratio, reason=f"{delay_us:.0f} us from sample to force")
@@ -304,15 +299,3 @@ def _robustness(profile: Profile, seeds: Sequence[int]) -> Iterator[Figure]:
     value = float("nan") if stopped else 1e9 * peak(late)
     remark = f"the reference goes off at {_SURGE_M_PER_S * 1e3:.0f} mm/s; strayed by {strayed:.0f} um before"
     yield judged(SATURATED, value, used, remark)
-    coarse = with_tables(profile, micro={"rated_force_n": 180.0, "rated_current_a": 6.0})
-    held = runs(coarse, "calibrated", np.zeros(8000, SETPOINT), seeds)
-    yield judged(COARSE_HOLD, 1e9 * max(rms(one.error_m) for one in held), used)
-    yield judged(COARSE_PEAK, peak_nm(runs(coarse, "calibrated", trapezoid(), seeds)), used)
-    for jitter_us in (0.1, 1.0):
-        bar = Bar(JITTER.figure.format(f"{jitter_us:g}"), JITTER.unit)
-        yield judged(bar, peak_nm(runs(profile, "calibrated", trapezoid(), seeds, jitter_s=1e-6 * jitter_us)), used)
-    cyclic = {"name": "cyclic_error", "acts_on": "end_sensor", "first_m": 2e-9, "second_m": 0.0}
-    cyclic |= {"wavelength_m": 316.5e-9, "first_phase_rad": 0.0, "second_phase_rad": 0.0}
-    shown = [one.model_copy(update={"effects": (*one.effects, cyclic)}) for one in machines(profile, "calibrated")]
-    followed = [run(profile, one, trapezoid(), seed) for one in shown for seed in seeds]
-    yield judged(CYCLIC, peak_nm(followed), used, "period 158 nm, of the end's reading")

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from bench import ablation, control_limit, identification_limit, learning, limits
+from bench import ablation, adaptive_drift, control_disturbed, control_limit, identification_limit, learning, limits
 from bench.figure import Bar, Figure, judged
 from stagectl.paper import gated, identification_test, recursive_least_squares, rig_chapter
 from stagectl.paper.chapters import CHAPTERS, work_through
@@ -60,7 +60,7 @@ def figures(*, full: bool, say: Say) -> Iterator[Figure]:
     yield from _table_2(samples)
     yield from _rig()
     yield from _costs(samples)
-    for part in (identification_limit, control_limit, limits, ablation, learning):
+    for part in (identification_limit, control_limit, control_disturbed, adaptive_drift, limits, ablation, learning):
         yield from part.figures(full=full, say=say)
     for chapter in work_through(tuple(CHAPTERS), lambda what, _: say(what)):
         yield from figures_of(chapter)

@@ -29,22 +29,3 @@ def believed(machine: Machine, profile: Profile) -> Machine:
         table = getattr(machine, name)
         axes[name] = table.model_copy(update={"mass_kg": axis.mass_kg, "force_constant_n_per_a": constant})
     return machine.model_copy(update=axes)
-
-
-AT_THE_LIMIT = {
-    "micro_bandwidth_hz": 48.0,
-    "eta_ratio": 3.4,
-    "gamma_ratio": 0.22,
-    "sliding_ratio": 3.75,
-    "micro_drift_n_per_sqrt_s": 0.052,
-    "adaptive_gain_ceiling_ratio": 0.05,
-}
-"""The gain set of decision 0017: 48 Hz is the crossover, and the observer's drift density alone sets the margin."""
-
-
-def at_the_limit(profile: Profile) -> Profile:
-    """Copy a profile with the gains that go as far as a quiet sensor lets them.
-
-    They are not the shipped ones: with 100 nm of noise an edge is identified 0.60 um off instead of 0.36 um.
-    """
-    return profile.model_copy(update={"control": profile.control.model_copy(update=AT_THE_LIMIT)})

@@ -128,15 +128,23 @@ _MISFIT_RATIO = 3.0  # of mean square residual to what noise explains
 _LEAVING_RATIO = 0.4  # of a hold's peak, below which the joint may have let go
 _SURE_SDS = 5.0  # that a force is beyond what the doubts explain by
 _RATIO_SHARE = 5e-4
+_SMALL_FORCE_N = 0.01  # an offset doubted by no more can wait for the gap until both edges are known: 1 um at 10 N/mm
 
 
 def believed_doubts(profile: "Profile") -> Doubts:
-    """Return what a profile leaves open: the micro's mass, or the force constant by as much, scaling every force."""
+    """Return what a profile leaves open: the micro's mass, or the force constant by as much, scaling every force.
+
+    And where the spring between the stages stands at its middle: zeros are laid by the edges, and 4 um beside it are
+    2 mN of offset, which went into both edges (0.2 um).
+    """
     if profile.micro is None:
         return Doubts()
     micro = profile.micro
     ratio = micro.mass_sd_kg / micro.mass_kg
-    return Doubts(micro.mass_sd_kg, ratio * micro.spring_n_per_m, ratio * micro.damping_n_s_per_m)
+    force_n = 0.0
+    if profile.backlash is not None:
+        force_n = min(micro.spring_n_per_m * profile.backlash.width_sd_m, _SMALL_FORCE_N)
+    return Doubts(micro.mass_sd_kg, ratio * micro.spring_n_per_m, ratio * micro.damping_n_s_per_m, force_n=force_n)
 
 
 def init(
@@ -144,9 +152,11 @@ def init(
     filter_s: float = 0.015,
     doubts: Doubts | None = None,
     force_noise_n: float = 5e-3,
-    edge_drift_m_per_sqrt_s: float = 0.0,
+    edge_drift_m_per_sqrt_s: float | None = None,
 ) -> np.ndarray:
     """Make BACKLASH: nothing known of edges and stiffness, whatever the profile believes.
+
+    Without a drift of the edges the profile's wear table says how they may wander.
 
     In closed loop the sensors' noise moves the stage, and what moves it is then no longer independent of the residual:
     at 100 nm a filter of 10 ms found a mass 2 % low, one of 15 ms finds it within its interval.
@@ -161,7 +171,8 @@ def init(
     b["least_force_n"] = 0.3
     b["force_share_ratio"] = 0.1
     b["margin_m"] = 10e-6
-    b["edge_drift_m_per_sqrt_s"] = edge_drift_m_per_sqrt_s
+    drift = profile.wear.edge_drift_m_per_sqrt_s if edge_drift_m_per_sqrt_s is None else edge_drift_m_per_sqrt_s
+    b["edge_drift_m_per_sqrt_s"] = drift
     b["position_noise_m"] = profile.interferometer.noise_m
     b["force_noise_n"] = force_noise_n
     # Chain of three: X = expm(A h), input integrals by a Taylor series of the augmented matrix (first-order hold)
@@ -182,7 +193,8 @@ def init(
         doubts = believed_doubts(profile)
     regression.prepare(b, doubts.variances)
     b["gap_margin_m"] = np.inf
-    if doubts.force_n > 0.0 and profile.backlash is not None:  # an offset and an edge differ in the gap alone
+    # A large offset and an edge differ in the gap alone.
+    if doubts.force_n > _SMALL_FORCE_N and profile.backlash is not None:
         b["gap_margin_m"] = 3.0 * profile.backlash.width_sd_m
     b["looks_for_knee"] = float(doubts.knee_n_m > 0.0)
     b["looks_for_hysteresis"] = float(doubts.hysteresis_n_per_m > 0.0)

@@ -173,6 +173,15 @@ TuneBandwidth = Annotated[
 ]
 TuneSensitivity = Annotated[float, _option("Greatest sensitivity Ms allowed.", "--max-sensitivity", min=1.05, max=10.0)]
 TuneDelay = Annotated[float, _option("Least delay margin, s.", "--delay-margin-s", min=0.0, max=0.01)]
+TuneMode = Annotated[
+    float | None,
+    _option("A flexible mode that a notch is for, known to +-3 % (default: none).", "--mode-hz", min=1.0, max=5000.0),
+]
+TuneResidue = Annotated[
+    float,
+    _option("Its residue against the rigid body's, at most.", "--mode-residue-ratio", min=0.001, max=0.4),
+]
+TuneDamping = Annotated[float, _option("Its damping ratio, at least.", "--mode-damping-ratio", min=1e-3, max=0.5)]
 
 _PROFILE, _RUNS, _GAP, _PAPER = "oled-printer", Path("runs"), Path("gap"), Path("paper")
 _BUDGET, _TUNE = Path("budget"), Path("tune")
@@ -379,6 +388,9 @@ def tune(
     bandwidth_hz: TuneBandwidth = None,
     max_sensitivity: TuneSensitivity = 2.0,
     delay_margin_s: TuneDelay = 0.8e-3,
+    mode_hz: TuneMode = None,
+    mode_residue_ratio: TuneResidue = 0.1,
+    mode_damping_ratio: TuneDamping = 0.01,
     out: TuneProfile = None,
     force: Force = False,
     page: TunePage = _TUNE,
@@ -387,9 +399,13 @@ def tune(
     """Find gains with a stated bandwidth and margin from the identified model; -o writes a new profile with them."""
 
     def work(voice: "Voice") -> "Answer":
+        from stagectl.tuning.mode import Mode
         from stagectl.tuning.rules import Asked
 
-        asked = Asked(max_sensitivity, delay_margin_s, bandwidth_hz)
+        mode = None
+        if mode_hz is not None:
+            mode = Mode(mode_hz, residue_ratio=mode_residue_ratio, damping_ratio=mode_damping_ratio)
+        asked = Asked(max_sensitivity, delay_margin_s, bandwidth_hz, mode)
         return commands.tune.show(voice, profile, law, asked, out, force, page)
 
     _deliver("tune", json, work)

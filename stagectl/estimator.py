@@ -3,7 +3,8 @@
 The believed machine is the same plant code as the simulator's, composed with the profile's effects. Between
 two samples it feels the integers that were sent: the old command until the SYNC that latches the new one, then
 the new one. A sample corrects position, velocity and an unknown force on each axis (a random walk), with the
-steady-state gains of the Kalman filter for that model. Prediction from the sample's instant to the instant the
+steady-state gains of the Kalman filter for that model; a notch keeps a flexible mode out of them where the profile has
+one. Prediction from the sample's instant to the instant the
 next command acts, lag and dead time of the profile's command effects included, is the same code run ahead. Pure;
 knows no bus and no clock.
 """
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stagectl import compose
+from stagectl import compose, notch
 from stagectl.compiled import compiled
 from stagectl.plant import PLANT_PARAMETERS, PLANT_STATE
 from stagectl.signals import Record
@@ -52,6 +53,7 @@ ESTIMATOR = np.dtype(
         ("end_seen_m", "f8"),
         ("macro_innovation_m", "f8"),
         ("end_innovation_m", "f8"),
+        *notch.FIELDS,  # of the axis that carries the end
     ]
 )
 
@@ -129,6 +131,7 @@ def init(profile: "Profile") -> np.ndarray:
     e["position_mode"] = float(profile.macro.mode == "position")
     noise_m = profile.interferometer.noise_m
     control = profile.control
+    notch.init(e, profile)
     e["macro_amperes_per_word"] = 1e-3 * profile.macro.rated_current_a
     gains = kalman_gains(profile.macro.mass_kg, period_s, noise_m, control.macro_drift_n_per_sqrt_s)
     e["macro_position_gain_ratio"], e["macro_velocity_gain_per_s"], e["macro_force_gain_n_per_m"] = gains
@@ -166,12 +169,15 @@ def correct(e: Record, s: Record, q: Record, macro_position_m: float, end_positi
     """Take a fresh sample into the believed machine."""
     innovation = macro_position_m - s.macro_position_m
     e.macro_innovation_m = innovation
+    if q.has_micro == 0.0:
+        innovation = notch.passed(e, innovation)
     s.macro_position_m += e.macro_position_gain_ratio * innovation
     s.macro_velocity_m_per_s += e.macro_velocity_gain_per_s * innovation
     s.macro_disturbance_n += e.macro_force_gain_n_per_m * innovation
     if q.has_micro != 0.0:
         innovation = end_position_m - s.end_position_m
         e.end_innovation_m = innovation
+        innovation = notch.passed(e, innovation)
         s.end_position_m += e.micro_position_gain_ratio * innovation
         s.end_velocity_m_per_s += e.micro_velocity_gain_per_s * innovation
         s.micro_disturbance_n += e.micro_force_gain_n_per_m * innovation

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stagectl import compose, estimator, plant
+from stagectl import compose, estimator, notch, plant
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
 from stagectl.signals import SETPOINT
@@ -295,6 +295,7 @@ def _tick_map(
     one.measurement["lease_left_ns"] = 1_000_000_000
     places = [(one.model, name) for name in _MODEL_STATES if _of_axes(name, axes)]
     places += [(one.estimator, name) for name in _ESTIMATOR_STATES if _of_axes(name, axes)]
+    places += [(one.estimator, name) for name in notch.LINEAR_STATES]
     places += [(one.law, name) for name in law_states if len(axes) == 2 or not name.startswith("macro_")]
     slots = _Slots(places, one.model["memory"][0, :memory_count])
     rest = one.snapshot()

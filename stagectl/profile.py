@@ -14,7 +14,7 @@ from stagectl.effect_file import EffectFile
 from stagectl.effect_table import EffectTable, without_micro
 from stagectl.errors import ProfileError
 from stagectl.interferometer_profile import Interferometer, carries_end
-from stagectl.toml_file import Document, Problem, Table, above, missing, problem_if, refuse, whole, within
+from stagectl.toml_file import Document, Flag, Problem, Table, above, missing, problem_if, refuse, whole, within
 
 PROFILES_FOLDER = Path(__file__).resolve().parent.parent / "profiles"
 SYSTEM_FOLDER = Path("/etc/stagectl")
@@ -257,6 +257,17 @@ class Backlash(Table):
         return self
 
 
+class Wear(Table):
+    """How the joint's wear is followed while the stage works, and what of it may be believed by itself."""
+
+    width_change_limit_m: Annotated[float, above(0.0, 1.0)] = 50e-6
+    stiffness_change_limit_ratio: Annotated[float, within(0.01, 10.0)] = 0.3
+    trusted_sd_m: Annotated[float, above(0.0, 1.0)] = 0.5e-6
+    edge_drift_m_per_sqrt_s: Annotated[float, within(0.0, 1e-3)] = 0.0  # that the estimator allows for
+    probe_every_s: Annotated[float, within(10.0, 1e8)] | None = None  # without it nothing is touched unasked
+    compensate: Flag = False
+
+
 class Air(Table):
     """Laser and air: what the index of air is computed from."""
 
@@ -298,6 +309,9 @@ class Control(Table):
     adaptive_gain_ceiling_ratio: Annotated[float, within(0.0, 10.0)] = 0.5
     macro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 5.0
     micro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 0.2
+    notch_frequency_hz: Annotated[float, within(0.0, 1e4)] = 0.0  # of the observer; 0 = none
+    notch_damping_ratio: Annotated[float, within(0.01, 2.0)] = 0.3  # how wide
+    notch_depth_ratio: Annotated[float, within(0.0, 1.0)] = 0.1  # what is left in the middle
 
     @model_validator(mode="after")
     def _check_law(self) -> "Control":
@@ -331,6 +345,7 @@ class Profile(Document):
     air: Air
     control: Control
     record: Record = Record()
+    wear: Wear = Wear()
     effect_files: tuple[EffectFile, ...] = ()  # before the effects that they declare
     effects: tuple[EffectTable, ...] = ()
 
@@ -403,11 +418,14 @@ class Profile(Document):
     @property
     def worst_bus_load_ratio(self) -> float:
         """Return the share of the bus that cyclic frames take when every stuff bit is needed."""
-        bits = _frame_bits(0)
-        for axis in self.axes:
-            by_position = axis == "macro" and self.macro.mode == "position"
-            bits += _frame_bits(8 if by_position else 4) + _frame_bits(8)
+        bits = self.command_frames_bits + len(self.axes) * frame_bits(8)
         return bits * self.cycle.rate_hz / self.can.bitrate_bit_per_s
+
+    @property
+    def command_frames_bits(self) -> int:
+        """Return the longest that SYNC and the RPDOs of one cycle can be."""
+        by_position = self.macro.mode == "position"
+        return frame_bits(0) + sum(frame_bits(8 if axis == "macro" and by_position else 4) for axis in self.axes)
 
     @model_validator(mode="after")
     def _check_relations(self, info: ValidationInfo) -> "Profile":
@@ -551,6 +569,13 @@ class Profile(Document):
             value = getattr(self.control, key)
             limit = f"must be at most a fifth of cycle.rate_hz, {fastest_hz:g} Hz"
             problems.append(problem_if(not value <= fastest_hz, f"control.{key}", value, limit, "lower it"))
+        notch_hz, limit = (
+            self.control.notch_frequency_hz,
+            f"must be below half of cycle.rate_hz, {fastest_hz * 2.5:g} Hz",
+        )
+        problems.append(
+            problem_if(not notch_hz < 2.5 * fastest_hz, "control.notch_frequency_hz", notch_hz, limit, "lower it")
+        )
         return problems
 
 
@@ -590,7 +615,7 @@ def _eds_path(name: str, profile_path: Path | None) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _frame_bits(data_bytes: int) -> int:
+def frame_bits(data_bytes: int) -> int:
     """Return the longest a classic CAN frame can be: all stuff bits and the space after it (ISO 11898-1)."""
     stuffed = 34 + 8 * data_bytes
     return stuffed + (stuffed - 1) // 4 + 13

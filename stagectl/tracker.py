@@ -70,8 +70,14 @@ class Tracker:
         self.hold["relative_position_m"] = relative_m + centre_m if belief["has_micro"][0] else 0.0
 
     def guide(self) -> None:
-        """From here the macro's drive brakes by itself: what it reports is the force that the macro feels."""
+        """From here the macro's drive brakes by itself: what it reports is the force that the macro feels.
+
+        A law that can park does: the micro has to stay off its hard stops, not on a reference. One that goes on at full
+        speed shakes the macro that it follows, and swung by 0.5 mm.
+        """
         self.active.estimator["position_mode"] = 1.0
+        if "park_error_m" in (self.active.law.dtype.names or ()):
+            self.active.law["park_error_m"] = -1.0  # below every error: it parks, and stays so
         self.active.guard["braking"] = 1.0
 
     def switch(self, law_number: int) -> None:

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from bench.variants import at_the_limit
 from stagectl import batch, cli, trajectory
 from stagectl.budget import budget, measured, shares
 from stagectl.budget.disturbances import COGGING, CONTACT, DELAY, FORCE, MODEL, SENSOR, STEP, forces_missing, noises_of
@@ -20,8 +19,8 @@ from tests.stage import followed, simulated, true_error_m, with_values
 
 @pytest.fixture(scope="module")
 def held(oled_profile, oled_machine):
-    """The budget of the shipped stage with the gains of decision 0017."""
-    return budget.of_machine(at_the_limit(oled_profile), "dsmc", oled_machine, seed=1)
+    """The budget of the stage that the project ships."""
+    return budget.of_machine(oled_profile, "dsmc", oled_machine, seed=1)
 
 
 def test_the_sum_of_the_sources_is_what_was_measured(held):
@@ -129,9 +128,7 @@ def test_the_bound_is_below_every_law_and_its_advice_saves_what_it_says(held, ol
     assert savings == sorted(savings, reverse=True)
     halved = next(lever for lever in held.levers if lever.what.startswith("halve the sensor's noise"))
     quiet = with_values(oled_machine, interferometer__noise_m=2.5e-9)
-    assert measured.hold(at_the_limit(oled_profile), quiet, "dsmc", seed=3).rms_m == pytest.approx(
-        halved.hold_m, rel=0.1
-    )
+    assert measured.hold(oled_profile, quiet, "dsmc", seed=3).rms_m == pytest.approx(halved.hold_m, rel=0.1)
 
 
 def test_an_unstable_loop_has_no_budget(oled_profile, oled_machine):

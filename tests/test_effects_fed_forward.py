@@ -55,10 +55,10 @@ def errors_m(profile, machine, law: str, extra: list[dict], known: bool) -> tupl
 @pytest.mark.parametrize(
     ("extra", "law", "unknown_nm", "known_nm"),
     [
-        (FORCES, "dsmc", 132.0, 4.3),
+        (FORCES, "dsmc", 73.0, 4.3),
         (FORCES, "pid", 390.0, 12.2),
         (COMMANDS, "dsmc", 322.0, 14.7),
-        (SENSORS, "dsmc", 51_800.0, 21.8),  # what delay and lag leave of the sensor's noise and of its own rounding
+        (SENSORS, "dsmc", 51_800.0, 5.3),  # what delay and lag leave of the sensor's noise and of its own rounding
     ],
     ids=["forces-dsmc", "forces-pid", "commands-dsmc", "sensors-dsmc"],
 )

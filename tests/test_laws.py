@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.variants import at_the_limit
 from sim_backend.machine import load_machine
 from stagectl import batch, estimator, plant, trajectory
 from stagectl.laws import dsmc, pid, reference
@@ -98,8 +97,8 @@ class Micro:
 
 @pytest.fixture
 def micro(oled_profile) -> Micro:
-    """With the gains of decision 0017, whose numbers the tests work out by hand."""
-    return Micro(at_the_limit(oled_profile))
+    """With the gains of the profile (decision 0017), whose numbers the tests work out by hand."""
+    return Micro(oled_profile)
 
 
 def test_force_is_the_papers_39_by_hand(micro):

@@ -4,6 +4,7 @@ import getpass
 import os
 import secrets
 import socket as sockets
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -78,11 +79,11 @@ def motion(
         _refuse_other(status, profile, usual_profile, backend)
         voice.note(f"{status.profile} through the service: {status.banner}")
         with leased(stage, token):
-            command = _prepared(voice, stage, status, name)
+            command = prepared(voice, stage, status, name)
             if command is None:
                 command = follow(voice, stage, name, body)
         at_rest = stage.status()
-    return _answer(command, at_rest)
+    return answered(command, at_rest)
 
 
 def _refuse_other(status: messages.Status, profile: str, usual_profile: str, backend: str) -> None:
@@ -101,7 +102,7 @@ def _refuse_other(status: messages.Status, profile: str, usual_profile: str, bac
         )
 
 
-def _prepared(voice: Voice, stage: Client, status: messages.Status, name: str) -> messages.Command | None:
+def prepared(voice: Voice, stage: Client, status: messages.Status, name: str) -> messages.Command | None:
     """Home and arm; returns what went wrong, None where the stage holds."""
     if name == "home":
         return None
@@ -128,7 +129,7 @@ def follow(voice: Voice, stage: Client, name: str, body: BaseModel) -> messages.
     return found
 
 
-def _answer(command: messages.Command, status: messages.Status) -> Answer:
+def answered(command: messages.Command, status: messages.Status) -> Answer:
     finished = command.stop in ("", _FINISHED)
     text = f"{command.name}: {command.text}"
     shown: list[RenderableType] = [escape(text) if finished else f"[red]ended early[/]: {escape(text)}"]
@@ -290,8 +291,6 @@ def _still_ours(seen: messages.Status, holder: str) -> None:
 
 def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> Answer:
     """Show what is recorded, begin a run, or end the one that was asked for."""
-    import time
-
     with connected(socket) as stage:
         if end or name is not None:
             if end:
@@ -305,6 +304,22 @@ def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> An
         text = f"{found.run}, begun by {found.trigger}" if found.run else "the last seconds only, in memory"
     shown = [escape(text), *([f"[red]{escape(found.trouble)}[/]"] if found is not None and found.trouble else [])]
     return Answer({"recording": None if found is None else found.model_dump()}, shown)
+
+
+def trigger(voice: Voice, socket: Path | None, body: dict | None, reversal: bool, end: bool) -> Answer:
+    """Show which event is waited for, set one, or end that."""
+    if reversal and body is not None and (body["error_m"] is not None or body["contact_force_n"] is not None):
+        raise RequestError("--reversal and a level are both given; give one of them")
+    with connected(socket) as stage:
+        if end:
+            stage.end_trigger()
+        elif body is not None:
+            stage.set_trigger(messages.SetTrigger.model_validate(checked("SetTrigger", **body).model_dump()))
+        if end or body is not None:
+            time.sleep(_POLL_S)
+        found = stage.status().recording
+    waits_for = "" if found is None else found.waits_for
+    return Answer({"waits_for": waits_for}, [f"waits for {waits_for}" if waits_for else "waits for no event"])
 
 
 def backend(voice: Voice, socket: Path | None, token: str | None, name: str | None) -> Answer:

@@ -3,24 +3,26 @@
 Any thread may call it; nothing here touches the stage. The stage's thread takes orders and publishes.
 """
 
+import contextlib
 import math
 import secrets
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from stagectl.errors import RequestError, StagectlError
 from stagectl.profile import Profile
 from stagectl.service import lease as leases
-from stagectl.service import messages, states
+from stagectl.service import messages, plans, states
 from stagectl.service.lease import Lease
 from stagectl.service.motions import MOTIONS
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import State
 from stagectl.service.view import jog_velocity_m_per_s
+from stagectl.streaming import SetpointBuffer
 
 _KEPT_ORDERS_COUNT = 1000
 
@@ -40,9 +42,20 @@ class Ending(RequestError):
 class Order:
     """A command on its way through the service."""
 
-    def __init__(self, key: str, name: str, body: Any, token: str, clock_s: Callable[[], float]):
-        """Wait to be carried out."""
+    def __init__(
+        self,
+        key: str,
+        name: str,
+        body: Any,
+        token: str,
+        clock_s: Callable[[], float],
+        plan: plans.Plan | None = None,
+    ):
+        """Wait to be carried out; `plan` is what was planned for it."""
         self.key, self.name, self.body, self.token = key, name, body, token
+        self.plan: Any = None if plan is None else plan.motion
+        """What was planned for it, until it is over."""
+        self._remark = "" if plan is None else plan.remark
         self._clock_s = clock_s
         self._message = messages.Command(key=key, name=name, state="waiting", share=0.0, at=now_text())
         self._velocity_m_per_s, self._until_s = 0.0, -math.inf
@@ -67,10 +80,13 @@ class Order:
 
     def finish(self, text: str, stop: str, run: str, backlash: messages.Backlash | None) -> None:
         """It came to an end; `stop` says which."""
+        text = f"{text}. {self._remark}" if self._remark else text
+        self.plan = None
         self._change(state="done", share=1.0, text=text, stop=stop, run=run, backlash=backlash)
 
     def fail(self, error: StagectlError) -> None:
         """It was refused, or something broke."""
+        self.plan = None
         failure = messages.Failure(kind=type(error).__name__, message=str(error))
         self._change(state="failed", text=str(error), error=failure)
 
@@ -84,6 +100,21 @@ class Order:
     def wanted_m_per_s(self) -> float | None:
         """Return the velocity that is wanted now; None where nobody holds the key any more."""
         return self._velocity_m_per_s if self._clock_s() < self._until_s else None
+
+
+@contextlib.contextmanager
+def _unfit() -> Iterator[None]:
+    """Say of what a plan refuses that the values don't fit."""
+    try:
+        yield
+    except RequestError as error:
+        raise Unfit(str(error)) from error
+
+
+def _stream_state(key: str, buffer: SetpointBuffer) -> messages.StreamState:
+    return messages.StreamState(
+        key=key, next_number=buffer.next_number, ahead_s=buffer.ahead_s, room_count=buffer.room_count
+    )
 
 
 class Desk:
@@ -100,6 +131,7 @@ class Desk:
         self._stop_reason = ""
         self._stop = threading.Event()
         self._record_request: str | None = None
+        self._trigger_request: messages.SetTrigger | str | None = None
         self._closed = False
         self._status: messages.Status | None = None
         self._state = State.OFF
@@ -161,6 +193,14 @@ class Desk:
             return None
         with self._lock:
             asked, self._record_request = self._record_request, None
+            return asked
+
+    def next_trigger_request(self) -> messages.SetTrigger | str | None:
+        """Take the event that somebody wants recorded, "" where none any more; None where nobody asked."""
+        if self._trigger_request is None:
+            return None
+        with self._lock:
+            asked, self._trigger_request = self._trigger_request, None
             return asked
 
     # ---- what clients do -------------------------------------------------------------------------------------
@@ -228,12 +268,83 @@ class Desk:
             self._record_request = name
             self._log.say("record", name or "end")
 
+    def set_trigger(self, body: messages.SetTrigger | None) -> None:
+        """Wait for an event to record, or for none any more; needs no lease. Errors: Busy, Ending, Unfit."""
+        with self._lock:
+            self._refuse_when_closed()
+            profile = self.profile
+            if body is not None and profile is None:
+                raise Busy("there is nothing to record: the stage is not connected")
+            if body is not None and profile is not None:
+                if body.error_m is not None and body.contact_force_n is not None:
+                    raise Unfit("error_m and contact_force_n are both given; give one, or none for a reversal")
+                if profile.record.when == "always":
+                    raise Unfit("record.when is always: the whole session is one run already; look into that")
+                if not body.before_s + body.after_s <= profile.record.flight_s:
+                    raise Unfit(
+                        f"before_s + after_s are {body.before_s + body.after_s:g} s, record.flight_s keeps "
+                        f"{profile.record.flight_s:g} s; ask for less, or raise it"
+                    )
+            self._trigger_request = "" if body is None else body
+            self._log.say("trigger", "none" if body is None else body.name)
+
     def _drop_waiting(self, reason: str) -> None:
         waiting, self._waiting = self._waiting, None
         if waiting is not None:
             waiting.fail(Busy(f"{waiting.name}: stopped before it began: {reason}"))
 
-    def submit(self, name: str, body: Any, key: str, token: str) -> messages.Command:
+    def submit_planned(self, name: str, body: Any, key: str, token: str) -> messages.Command:
+        """Plan a scan or a table, check it, and take it over like `submit`; plans without the lock."""
+        with self._lock:
+            if key in self._orders:
+                return self.submit(name, plans.kept(body), key, token)
+        profile, holds_m = self._where_it_holds(name, token)
+        with _unfit():
+            plan = plans.scanned(body, profile, holds_m) if name == "scan" else plans.followed(body, profile)
+        return self.submit(name, plans.kept(body), key, token, plan)
+
+    def take_setpoints(self, body: messages.Setpoints, token: str) -> messages.StreamState:
+        """Begin a stream, or take what goes on with it. Errors: RequestError and kinds; then none of it is taken."""
+        with self._lock:
+            leases.holds(self._lease, token, self._clock_s())
+            order = self._current
+            known = order.plan if order is not None and order.name == "setpoints" and not order.over else None
+            if known is not None and self._stop.is_set():
+                raise Busy("the stage is coming to rest; wait until it stands")
+        if order is not None and known is not None:
+            with _unfit():
+                if body.period_s != order.body.period_s:
+                    raise RequestError(f"period_s is {body.period_s:g}, the stream began with {order.body.period_s:g}")
+                known.take(body.first_number, body.position_m, body.last)
+            return _stream_state(order.key, known)
+        if body.first_number != 0:
+            raise Unfit(f"set-point {body.first_number} comes too late: no stream is under way; begin with number 0")
+        profile, holds_m = self._where_it_holds("setpoints", token)
+        with _unfit():
+            plan = plans.streamed(body, profile, holds_m)
+        command = self.submit("setpoints", plans.kept(body), f"stream-{secrets.token_hex(8)}", token, plan)
+        return _stream_state(command.key, plan.motion)
+
+    def stream_state(self) -> messages.StreamState | None:
+        """Say how the stream under way stands; None where there is none."""
+        with self._lock:
+            order = self._current
+            buffer = order.plan if order is not None and order.name == "setpoints" else None
+            return None if order is None or buffer is None else _stream_state(order.key, buffer)
+
+    def _where_it_holds(self, name: str, token: str) -> tuple[Profile, float]:
+        """Return profile and reference of a stage that can move now. Errors: RequestError and kinds."""
+        with self._lock:
+            self._refuse_when_closed()
+            leases.holds(self._lease, token, self._clock_s())
+            profile, status = self.profile, self._status
+            states.after(self._state, MOTIONS[name].event)
+        holds_m = None if status is None else status.positions.setpoint_position_m
+        if profile is None or holds_m is None:
+            raise RequestError(f"{name}: the stage is not connected; `stagectl status` says what it waits for")
+        return profile, holds_m
+
+    def submit(self, name: str, body: Any, key: str, token: str, plan: plans.Plan | None = None) -> messages.Command:
         """Take a command over, or return what became of it where its key was seen. Errors: RequestError and kinds."""
         with self._lock:
             known = self._orders.get(key)
@@ -247,11 +358,17 @@ class Desk:
             if name in MOTIONS:
                 states.after(self._state, MOTIONS[name].event)
             self._check_values(name, body)
-            order = Order(key, name, body, token, self._clock_s)
+            order = Order(key, name, body, token, self._clock_s, plan)
             if name == "jog_at":
                 order.hold(body.velocity_m_per_s, body.hold_s)
             self._keep_order(order)
             return order.message()
+
+    def submit_own(self, name: str, body: Any) -> None:
+        """Submit a command of the service's own, under the lease that somebody holds; not where one is under way."""
+        with self._lock, contextlib.suppress(RequestError):
+            if self._lease is not None:
+                self.submit(name, body, f"own-{secrets.token_hex(8)}", self._lease.token)
 
     def jog_at(self, body: messages.JogAt, token: str) -> messages.Command:
         """Begin to jog, or go on at this velocity. Errors: RequestError and kinds."""
@@ -301,5 +418,7 @@ class Desk:
         top = jog_velocity_m_per_s(profile)
         if name == "jog_at" and not abs(body.velocity_m_per_s) <= top:
             raise Unfit(f"velocity_m_per_s is {body.velocity_m_per_s:g}: a jog may do {top:g} m/s; ask for less")
-        if name == "identify" and profile.micro is None:
+        if name == "probe" and profile.wear.probe_every_s is None:
+            raise Unfit(f"profile {profile.name} permits no touch probe; give wear.probe_every_s, or identify instead")
+        if name in ("identify", "probe") and profile.micro is None:
             raise Unfit(f"profile {profile.name}: this stage has no micro; there is no backlash to identify")

@@ -61,16 +61,94 @@ class Identify(_Asked):
     duration_s: Annotated[Finite, Field(ge=2.0, le=240.0)] = 20.0
 
 
+class Segment(_Asked):
+    """One part of a scan: to a position, there at rest for `dwell_s`, or passing it without a stop."""
+
+    target_m: Annotated[Finite, Field(ge=-100.0, le=100.0)]
+    velocity_m_per_s: Annotated[Finite, Field(gt=0.0, le=20.0)] | None = None
+    """At most; without it, as fast as a move."""
+    pass_velocity_m_per_s: Annotated[Finite, Field(ge=-20.0, le=20.0)] = 0.0
+    """With which the target is passed, signed: the next segment goes on from there."""
+    dwell_s: Annotated[Finite, Field(ge=0.0, le=3600.0)] = 0.0
+
+
+class Scan(_Asked):
+    """A scan program: its segments one after the other, `repeat_count` times; begins at `start_m`, or where it is."""
+
+    segments: Annotated[list[Segment], Field(min_length=1, max_length=200)]
+    repeat_count: Annotated[int, Field(ge=1, le=10**6)] = 1
+    start_m: Annotated[Finite, Field(ge=-100.0, le=100.0)] | None = None
+    law: LawName | None = None
+
+
+class Follow(_Asked):
+    """A motion over time: CSV with the header `t_s,position_m`, smoothed by a quintic spline, at rest at its ends."""
+
+    text: Annotated[str, Field(min_length=1, max_length=2_000_000)]
+    name: RunName = "trajectory"
+    law: LawName | None = None
+
+
+class Followed(BaseModel):
+    """What is kept of such a motion's request."""
+
+    name: str
+    law: LawName | None
+    sha256: str
+
+
+class Setpoints(_Asked):
+    """Positions `period_s` apart, ahead of time, numbered from 0; number 0 is where the stage holds and begins."""
+
+    first_number: Annotated[int, Field(ge=0, le=10**12)]
+    period_s: Annotated[Finite, Field(ge=1e-4, le=1.0)]
+    position_m: Annotated[list[Finite], Field(min_length=1, max_length=2000)]
+    last: bool = False
+    """Whether the stage comes to rest behind these."""
+
+
+class StreamBegun(BaseModel):
+    """What is kept of the request that began a stream."""
+
+    period_s: float
+
+
+class StreamState(BaseModel):
+    """How a stream stands: what must come next, for how long there is enough, how many have room."""
+
+    key: str
+    """Of the command; says what became of it."""
+    next_number: int
+    ahead_s: float
+    room_count: int
+
+
+class Probe(_Asked):
+    """Touch both edges with a few newtons; only where the profile permits it."""
+
+
 class SwapBackend(_Asked):
     """Work in another world; only without power."""
 
-    backend: Literal["auto", "hardware", "rig"]
+    backend: Literal["auto", "hardware", "rig", "rig-drives", "rig-sensor"]
 
 
 class StartRecord(_Asked):
     """Begin a run on request."""
 
     name: RunName = "request"
+
+
+class SetTrigger(_Asked):
+    """Record what is around an event: an error above a level, a contact above a force; without either, a reversal."""
+
+    name: RunName = "trigger"
+    error_m: Annotated[Finite, Field(gt=0.0, le=1.0)] | None = None
+    contact_force_n: Annotated[Finite, Field(gt=0.0, le=1e6)] | None = None
+    before_s: Annotated[Finite, Field(ge=0.0, le=600.0)] = 1.0
+    after_s: Annotated[Finite, Field(ge=0.0, le=600.0)] = 1.0
+    count: Annotated[int, Field(ge=1, le=1000)] = 1
+    """How often it may."""
 
 
 class Acknowledge(_Asked):
@@ -100,6 +178,31 @@ class Backlash(BaseModel):
     """When, UTC."""
     run: str
     profile_name: str
+
+
+class Wear(BaseModel):
+    """The joint as production motion, a probe or an identification showed it last, and how sure that is now."""
+
+    left_m: float
+    right_m: float
+    left_stiffness_n_per_m: float
+    right_stiffness_n_per_m: float
+    left_stiffness_sd_n_per_m: float | None
+    right_stiffness_sd_n_per_m: float | None
+    width_m: float
+    width_sd_m: float | None
+    """Grows with the age."""
+    at: str
+    age_s: float
+    source: str
+    """production | touch probe | identified"""
+    observable: bool
+    """Whether both edges were touched lately; where not, the last value stands here."""
+    text: str
+    alarm: str
+    """Which limit of wear is passed; empty where none."""
+    believed_since: str
+    """When the compensation took a value over by itself, UTC; empty where it did not."""
 
 
 class Fault(BaseModel):
@@ -154,6 +257,8 @@ class Recording(BaseModel):
     rows_count: int
     trouble: str
     """What the disk refuses; empty where all is well."""
+    waits_for: str = ""
+    """The event that is waited for, and how often still; empty where none is."""
 
 
 class Health(BaseModel):
@@ -207,6 +312,7 @@ class Status(BaseModel):
     positions: Positions
     health: Health
     backlash: Backlash | None
+    wear: Wear | None
     fault: Fault | None
     lease: LeaseState | None
     command: Command | None

@@ -15,7 +15,7 @@ def report(title: str, tuned: Tuned, asked: Asked) -> Report:
         margins_table(tuned),
         Figure("Loop gain in the gap", gain_figure(tuned), "Broken at the command of the axis that carries the end."),
         Figure("Sensitivity", sensitivity_figure(tuned, asked), "What the loop makes of a disturbance: 1 = nothing."),
-        Section("The rules", _rules(tuned.law)),
+        Section("The rules", _rules(tuned)),
     ]
     return Report(title, verdict(tuned), parts=parts)
 
@@ -76,13 +76,19 @@ def _mass(which: Assessment) -> str:
     return "stable" if which.stable_with_other_mass else "unstable"
 
 
-def _rules(law: str) -> list[str]:
-    if law == "pid":
+def _rules(tuned: Tuned) -> list[str]:
+    if tuned.law == "pid":
         return ["PID has one number, its bandwidth; gains follow from it as `stagectl/laws/pid.py` says."]
-    return [
+    said = [
         "One end of the loop is fast, the other sets the margin: the law is as fast as the cycle allows, k / m at 0.18 "
         "and eta at 0.163 of its rate.",
         "With w the bandwidth, the integral is at w / 8 and the observer's poles at 2 w / 3, by the density of the "
         "force that it reckons with.",
         "The bandwidth is the number that was searched; its margins hold up to the adaptive gain's ceiling (adapted).",
     ]
+    if tuned.values.get("notch_frequency_hz", 0.0) > 0.0:
+        said.append(
+            "The notch is in what the observer learns from the sensor, not in the command. Of several widths and "
+            "depths it is the one that leaves the greatest bandwidth, wherever within its bounds the mode is."
+        )
+    return said

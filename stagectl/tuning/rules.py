@@ -5,14 +5,16 @@ eta = 0.163 of the cycle's rate, in 2 pi. With w the bandwidth its integral is a
 of the observer at 2 w / 3, by the density of the force that it reckons with (Kwakernaak, Sivan, Linear Optimal Control
 Systems, section 5.3: the law's end recovers the observer's margins). The adaptive gain may rise by 5 %. What is left is
 one number, w: it is made as large as the margins allow, the adaptive gain at its ceiling included, or as the bandwidth
-that is asked for takes. PID has its bandwidth as that one number.
+that is asked for takes. PID has its bandwidth as that one number. A flexible mode that is known gets a notch
+(`stagectl.tuning.mode`), and the bandwidth that the notch leaves.
 
 Every result is checked in the gap and in contact on either side, and with the moved mass 10 % off.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +25,8 @@ from stagectl.budget.disturbances import noises_of
 from stagectl.errors import RequestError
 from stagectl.linear_loop import GAP, LEFT, RIGHT, Body, Linearised, believed_body, linearise
 from stagectl.margins import Margins, grid_hz, margins
+from stagectl.tuning import mode as modes
+from stagectl.tuning.mode import Mode
 
 if TYPE_CHECKING:
     from stagectl.profile import Profile
@@ -42,6 +46,7 @@ _OBSERVER_RATIO = 0.67  # of the bandwidth: where the poles of a Kalman filter o
 _SPAN = (1e-2, 1e2)  # of the profile's own number, searched
 _GRID_COUNT = 13
 _BISECTIONS = 7
+_USUAL_SENSITIVITY = 2.0
 _SLACK = 1.002  # of a limit that a search ends at
 
 
@@ -49,9 +54,11 @@ _SLACK = 1.002  # of a limit that a search ends at
 class Asked:
     """What gains have to keep; `bandwidth_hz` None = as much as the margins allow."""
 
-    max_sensitivity: float = 2.0
+    max_sensitivity: float = _USUAL_SENSITIVITY
     delay_margin_s: float = 0.8e-3
     bandwidth_hz: float | None = None
+    mode: Mode | None = None
+    """A flexible mode that the machine has and the profile doesn't; sensitivity has to be kept with it too."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,26 +115,59 @@ def tuned(
     Errors: RequestError where the identified model is unstable under every gain, or a bandwidth has no such margin.
     """
     say("judging the gains as they are", 0.0)
-    before = assessed(profile, law)
+    mode = asked.mode
+    if mode is not None:
+        _refuse_mode(profile, law, mode)
+    before = assessed(profile, law, mode)
     key = _key(profile, law)
     say("searching", 0.2)
-    value = _searched(profile, law, key, asked)
+    # The mode may cost margin, and that is no reason to be faster: without it the loop keeps to the usual one.
+    bare = asked if mode is None else replace(asked, max_sensitivity=min(asked.max_sensitivity, _USUAL_SENSITIVITY))
+    value = _searched(profile, law, key, bare)
+    notch: dict[str, float] = {}
+    if mode is not None:
+        say("fitting the notch", 0.5)
+        value, notch = _searched_with(profile, law, mode, asked, value)
     say("checking it everywhere", 0.7)
-    found = assessed(_with(profile, law, value), law)
+    found = assessed(_with(profile, law, value, notch), law, mode)
     while asked.bandwidth_hz is None and not _keeps(found, asked):  # a place that is worse than the gap
         value *= 0.9
         if value < _SPAN[0] * getattr(profile.control, key):
             break
-        found = assessed(_with(profile, law, value), law)
+        found = assessed(_with(profile, law, value, notch), law, mode)
     _refuse(profile, law, asked, found)
     rounded = float(f"{value:.4g}")
-    values = _gains(profile, law, rounded)
+    values = _gains(profile, law, rounded) | notch
     old = {name: float(getattr(profile.control, name)) for name in values}
-    return Tuned(law, values, old, before, assessed(_with(profile, law, rounded), law))
+    return Tuned(law, values, old, before, assessed(_with(profile, law, rounded, notch), law, mode))
 
 
-def assessed(profile: "Profile", law: str) -> Assessment:
-    """Judge a profile's gains with the machine that it believes in."""
+def _refuse_mode(profile: "Profile", law: str, mode: Mode) -> None:
+    half_hz = 0.5 * profile.cycle.rate_hz
+    if law != "dsmc":
+        raise RequestError(f"a mode at {mode.frequency_hz:g} Hz needs a notch, and {law} has none; take --law dsmc")
+    if not 0.0 < mode.frequency_hz < half_hz:
+        raise RequestError(
+            f"a mode at {mode.frequency_hz:g} Hz: a notch lies below half of cycle.rate_hz, {half_hz:g} Hz; above it a "
+            "sampled loop sees the mode elsewhere: damp it, or sample faster"
+        )
+
+
+def _searched_with(
+    profile: "Profile", law: str, mode: Mode, asked: Asked, bandwidth_hz: float
+) -> tuple[float, dict[str, float]]:
+    """Return bandwidth and notch; a bandwidth that is asked for stays what it is."""
+    body = believed_body(profile)
+
+    def made(value: float, notch: Mapping[str, float]) -> Linearised:
+        one = _with(profile, law, value, notch)
+        return linearise(one, law, body, GAP, most_adaptive_gain_ratio(one, law))
+
+    return modes.searched(made, mode, asked.max_sensitivity, bandwidth_hz, may_slow=asked.bandwidth_hz is None)
+
+
+def assessed(profile: "Profile", law: str, mode: Mode | None = None) -> Assessment:
+    """Judge a profile's gains with the machine that it believes in, and with a mode beside it."""
     body = believed_body(profile)
     frequency_hz = grid_hz(profile.cycle.period_s)
     loops = []
@@ -136,9 +176,12 @@ def assessed(profile: "Profile", law: str) -> Assessment:
             continue
         one = linearise(profile, law, body, place)
         loops.append(Loop(said, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
-    if most := most_adaptive_gain_ratio(profile, law):
+    most = most_adaptive_gain_ratio(profile, law)
+    if most:
         one = linearise(profile, law, body, GAP, most)
         loops.append(Loop(CEILING, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
+    if mode is not None:
+        loops += _loops_with(linearise(profile, law, body, GAP, most), mode)
     in_gap = linearise(profile, law, body)
     hold_m, peak_m = math.nan, math.nan
     if loops[0].margins.is_stable:
@@ -146,6 +189,22 @@ def assessed(profile: "Profile", law: str) -> Assessment:
         peak_m = step_peak_m(in_gap)
     stable = all(linearise(profile, law, _heavier(body, profile, ratio)).closed().is_stable() for ratio in _OFF)
     return Assessment(tuple(loops), hold_m, peak_m, stable)
+
+
+def _loops_with(one: Linearised, mode: Mode) -> list[Loop]:
+    """Return the loop with the mode where it is thought to be, and as far off as it may be."""
+    off = mode.frequency_off_ratio
+    loops = []
+    for ratio in (1.0 - off, 1.0, 1.0 + off):
+        at_hz = ratio * mode.frequency_hz
+        row = modes.effect(at_hz, mode.residue_ratio, mode.damping_ratio)
+        with_mode = replace(one, body=modes.with_effect(one.body, row))
+        frequency_hz = modes.grid_around(with_mode.period_s, mode)
+        found = margins(with_mode)
+        gain = with_mode.loop_gain(frequency_hz)
+        peak = max(found.sensitivity_peak_ratio, float(np.max(1.0 / np.abs(1.0 + gain))))
+        loops.append(Loop(f"mode at {at_hz:.0f} Hz", replace(found, sensitivity_peak_ratio=peak), frequency_hz, gain))
+    return loops
 
 
 def most_adaptive_gain_ratio(profile: "Profile", law: str) -> float:
@@ -196,8 +255,10 @@ def _gains(profile: "Profile", law: str, bandwidth_hz: float) -> dict[str, float
     return {key: bandwidth_hz, **rounded, "adaptive_gain_ceiling_ratio": _CEILING_RATIO}
 
 
-def _with(profile: "Profile", law: str, bandwidth_hz: float) -> "Profile":
-    gains = _gains(profile, law, bandwidth_hz)
+def _with(
+    profile: "Profile", law: str, bandwidth_hz: float, notch: Mapping[str, float] = MappingProxyType({})
+) -> "Profile":
+    gains = _gains(profile, law, bandwidth_hz) | dict(notch)
     return profile.model_copy(update={"control": profile.control.model_copy(update=gains)})
 
 

@@ -1,0 +1,230 @@
+"""Control at the limit on a machine that has one thing more: a mode, a base that shakes, a cyclic error, coarse words.
+
+Every figure of `bench.control_limit` is measured again; here stands the worst of them, over its bar there. Where no bar
+applies a bound is computed beside it: of the linear loop for what shakes it, of LQG for what makes the sensor or the
+motor coarser. The mode's own gain set is what `stagectl tune --mode-hz` makes of it.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bench import control_limit as limit
+from bench.figure import Bar, Figure, judged
+from bench.following import rms
+from sim_backend.machine import Machine
+from stagectl.budget import lqg
+from stagectl.budget.lqg import Surroundings
+from stagectl.linear_loop import GAP, linearise, machine_body
+from stagectl.profile import Profile
+from stagectl.signals import SETPOINT
+from stagectl.tuning import mode as modes
+from stagectl.tuning.mode import Mode
+from stagectl.tuning.rules import Asked, Tuned, step_peak_m, tuned
+
+MODES_HZ = (120.0, 160.0, 200.0, 275.0, 350.0)
+SHAKEN_HZ = (30.0, 100.0, 200.0, 300.0)
+JITTERS_S = (0.1e-6, 1e-6)
+
+MODE_SENSITIVITY = "control, mode at {hz:g} Hz: Ms, wherever within 3 % and however damped it is"
+MODE_WORST = "control, mode at {hz:g} Hz: worst of the figures over its bar"
+SHAKEN = "control, base shakes with 6.25 um/s rms at {hz:g} Hz: worst of the figures over its bar"
+SHAKEN_HOLD = "control, base shakes with 6.25 um/s rms at {hz:g} Hz: hold over what the linear loop foretells"
+CYCLIC = Bar("control, cyclic error 2 nm: worst of the figures over its bar", "1", 2.0)
+COARSE = Bar("control, torque step 0.18 N: hold over the optimum at Ms 2.0 as stiff", "1", 1.2)
+COARSE_HOLD = Bar("control, torque step 0.18 N: hold, rms", "nm")
+COARSE_PEAK = Bar("control, torque step 0.18 N, contact-free, calibrated: peak", "nm")
+JITTER = "control, sample jitter {us:g} us rms, 0.2 m/s: rms at constant speed over the optimum at Ms 2.0 as stiff"
+JITTER_PEAK = "control, sample jitter {us:g} us rms, contact-free, calibrated: peak"
+
+_SENSITIVITY = 2.5
+_TWICE = 2.0
+_OF_BOUND = 1.2
+_FROM_HZ = 200.0
+_SHAKING_M_PER_S = 6.25e-6  # rms, criterion VC-D (Amick et al., Proc. SPIE 5933, 2005)
+_SPEED_M_PER_S = 0.2
+_HOLD_ROWS = 8000
+_FORCE_NOISE_N = 5e-3
+
+Say = Callable[[str], None]
+
+
+def figures(*, full: bool, say: Say) -> Iterator[Figure]:
+    """Measure every row."""
+    seeds = limit.SEEDS if full else limit.SEEDS[:2]
+    for hz in MODES_HZ:
+        say(f"control at the limit: a mode at {hz:g} Hz")
+        yield from _with_mode(hz, seeds)
+    say("control at the limit: a base that shakes")
+    for hz in SHAKEN_HZ:
+        yield from _shaken(hz, seeds)
+    cyclic = {"name": "cyclic_error", "acts_on": "end_sensor", "first_m": 2e-9, "second_m": 0.0}
+    cyclic |= {"wavelength_m": 316.5e-9, "first_phase_rad": 0.0, "second_phase_rad": 0.0}
+    value, remark = over_bars(limit.stage(), [cyclic], seeds)
+    yield judged(CYCLIC, value, list(seeds), f"{remark}; period 158 nm, of the end's reading")
+    say("control at the limit: coarse words, jitter")
+    yield from _coarse(seeds)
+    yield from _jitter(seeds)
+
+
+def over_bars(profile: Profile, effects: Sequence[dict[str, Any]], seeds: Sequence[int]) -> tuple[float, str]:
+    """Follow what `bench.control_limit` follows with machines that have effects more.
+
+    Returns the worst figure over its bar there (nan where a run was stopped), and all of them in words.
+    """
+    found = {}
+    held = _runs(profile, "wrong", np.zeros(_HOLD_ROWS, SETPOINT), effects, seeds)
+    found["hold"] = 1e9 * max(rms(one.error_m) for one in held) / _limit(limit.HOLD)
+    for name, bar, kind in (
+        ("free, wrong", limit.FREE_WRONG, "wrong"),
+        ("free, calibrated", limit.FREE_CALIBRATED, "calibrated"),
+    ):
+        followed = _runs(profile, kind, limit.trapezoid(), effects, seeds)
+        found[name] = limit.peak_nm(followed) / _limit(bar)
+    scanned = [limit.scan_nm(one, profile.cycle.rate_hz) for one in followed]
+    found["MA"] = max(average for average, _ in scanned) / _limit(limit.AVERAGE)
+    found["MSD"] = max(deviation for _, deviation in scanned) / _limit(limit.DEVIATION)
+    for name, bar, kind in (
+        ("contact, wrong", limit.CONTACT_WRONG, "wrong"),
+        ("contact, calibrated", limit.CONTACT_CALIBRATED, "calibrated"),
+    ):
+        followed = _runs(limit.weak(profile), kind, limit.trapezoid(), effects, seeds)
+        found[name] = limit.peak_nm(followed) / _limit(bar)
+    fast = _runs(profile, "wrong", limit.trapezoid(0.4), effects, seeds)
+    found["settling"] = max(limit.settling_ms(one) for one in fast) / _limit(limit.SETTLING)
+    worst = math.nan if any(math.isnan(value) for value in found.values()) else max(found.values())
+    return worst, ", ".join(f"{name} {value:.2f}" for name, value in found.items())
+
+
+def _limit(bar: Bar) -> float:
+    if bar.limit is None:
+        raise ValueError(f"{bar.figure} has no bar")
+    return bar.limit
+
+
+def _runs(
+    profile: Profile, kind: str, setpoints: np.ndarray, effects: Sequence[dict[str, Any]], seeds: Sequence[int]
+) -> list[limit.Run]:
+    return [
+        limit.run(profile, _with(one, effects), setpoints, seed)
+        for one in limit.machines(profile, kind)
+        for seed in seeds
+    ]
+
+
+def _with(one: Machine, effects: Sequence[dict[str, Any]]) -> Machine:
+    return one.model_copy(update={"effects": (*one.effects, *effects)})
+
+
+# ---- a flexible mode ----------------------------------------------------------------------------------------------
+
+
+def gains_for(hz: float) -> Tuned:
+    """Return what `tune` makes of the stage with a mode there."""
+    return tuned(limit.stage(), "dsmc", Asked(max_sensitivity=_SENSITIVITY, mode=Mode(hz)))
+
+
+def _with_mode(hz: float, seeds: Sequence[int]) -> Iterator[Figure]:
+    found = gains_for(hz)
+    profile = limit.stage(**found.values)
+    mode = Mode(hz)
+    loop = linearise(profile, "dsmc", machine_body(limit.machine(profile)), GAP, _ceiling(profile))
+    sensitivity = modes.worst_sensitivity(loop, mode)
+    notch = f"notch {profile.control.notch_damping_ratio:g} wide, {profile.control.notch_depth_ratio:g} deep"
+    if profile.control.notch_frequency_hz == 0.0:
+        notch = "no notch"
+    remark = f"{notch}, bandwidth {profile.control.micro_bandwidth_hz:.0f} Hz; residue -10 %, damping 1 %, and half"
+    yield judged(Bar(MODE_SENSITIVITY.format(hz=hz), "1", _SENSITIVITY), sensitivity, reason=remark)
+    row = max(
+        mode.corners(), key=lambda one: modes.sensitivity(replace(loop, body=modes.with_effect(loop.body, one)), mode)
+    )
+    value, remark = over_bars(profile, [row], seeds)
+    softer = found.after.step_peak_m / found.before.step_peak_m
+    bar = Bar(MODE_WORST.format(hz=hz), "1", _TWICE if hz >= _FROM_HZ else None)
+    said = f"{remark}; computed: a force moves the end {softer:.2f} times as far as without the mode"
+    yield judged(bar, value, list(seeds), said)
+
+
+def _ceiling(profile: Profile) -> float:
+    return profile.control.adaptive_gain_ceiling_ratio
+
+
+# ---- a base that shakes --------------------------------------------------------------------------------------------
+
+
+def _shaken(hz: float, seeds: Sequence[int]) -> Iterator[Figure]:
+    amplitude = math.sqrt(2.0) * _SHAKING_M_PER_S * 2.0 * math.pi * hz
+    rows = [
+        {
+            "name": "base_vibration",
+            "acts_on": f"{axis}_force",
+            "amplitude_m_per_s2": amplitude,
+            "frequency_hz": hz,
+            "phase_rad": 0.0,
+        }
+        for axis in ("macro", "micro")
+    ]
+    profile = limit.stage()
+    value, remark = over_bars(profile, rows, seeds)
+    used = list(seeds)
+    yield judged(Bar(SHAKEN.format(hz=hz), "1", _TWICE if hz >= _FROM_HZ else None), value, used, remark)
+    loop = linearise(profile, "dsmc", machine_body(limit.machine(profile))).closed()
+    moved = sum(
+        profile.axis(axis).mass_kg * amplitude * loop.response(np.array([hz]), f"{axis}_force_n", "end_position_m")[0]
+        for axis in profile.axes
+    )
+    still_m = max(rms(one.error_m) for one in _runs(profile, "wrong", np.zeros(_HOLD_ROWS, SETPOINT), [], seeds))
+    foretold_m = math.hypot(abs(moved) / math.sqrt(2.0), still_m)
+    held_m = max(rms(one.error_m) for one in _runs(profile, "wrong", np.zeros(_HOLD_ROWS, SETPOINT), rows, seeds))
+    said = f"{1e9 * held_m:.1f} nm, computed {1e9 * foretold_m:.1f} nm; {1e9 * still_m:.1f} nm without"
+    yield judged(Bar(SHAKEN_HOLD.format(hz=hz), "1"), held_m / foretold_m, used, said)
+
+
+# ---- coarse words, jitter ------------------------------------------------------------------------------------------
+
+
+def least_m(profile: Profile, sensor_noise_m: float) -> float:
+    """Return the best hold at Ms 2.0 of a loop that a force moves no further than the profile's, m."""
+    axis = profile.axis("micro")
+    around = Surroundings(
+        mass_kg=axis.mass_kg,
+        period_s=profile.cycle.period_s,
+        delay_s=profile.cycle.actuation_delay_s + axis.current_loop_s,
+        sensor_noise_m=sensor_noise_m,
+        force_noise_n=_FORCE_NOISE_N,
+        torque_step_n=axis.torque_step_n,
+    )
+    loop = linearise(profile, "dsmc", machine_body(limit.machine(profile)))
+    return lqg.optimum(around, 2.0, step_peak_m(loop) / 0.1).true_rms_m
+
+
+def _coarse(seeds: Sequence[int]) -> Iterator[Figure]:
+    coarse = limit.with_tables(limit.stage(), micro={"rated_force_n": 180.0, "rated_current_a": 6.0})
+    used = list(seeds)
+    held_m = max(rms(one.error_m) for one in limit.runs(coarse, "calibrated", np.zeros(_HOLD_ROWS, SETPOINT), seeds))
+    best_m = least_m(coarse, coarse.interferometer.noise_m)
+    yield judged(COARSE, held_m / best_m, used, f"the optimum holds to {1e9 * best_m:.2f} nm")
+    yield judged(COARSE_HOLD, 1e9 * held_m, used)
+    yield judged(COARSE_PEAK, limit.peak_nm(limit.runs(coarse, "calibrated", limit.trapezoid(), seeds)), used)
+
+
+def _jitter(seeds: Sequence[int]) -> Iterator[Figure]:
+    profile, used = limit.stage(), list(seeds)
+    for jitter_s in JITTERS_S:
+        followed = limit.runs(profile, "calibrated", limit.trapezoid(), seeds, jitter_s=jitter_s)
+        at_speed_m = max(rms(one.error_m[_steady(one)]) for one in followed)
+        best_m = least_m(profile, math.hypot(profile.interferometer.noise_m, _SPEED_M_PER_S * jitter_s))
+        us = 1e6 * jitter_s
+        said = (
+            f"{1e9 * at_speed_m:.1f} nm; the optimum for that much noise of the sensor holds to {1e9 * best_m:.1f} nm"
+        )
+        yield judged(Bar(JITTER.format(us=us), "1", _OF_BOUND), at_speed_m / best_m, used, said)
+        yield judged(Bar(JITTER_PEAK.format(us=us), "nm"), limit.peak_nm(followed), used)
+
+
+def _steady(one: limit.Run) -> np.ndarray:
+    speed = np.abs(one.setpoints["velocity_m_per_s"])
+    return (speed >= (1.0 - 1e-9) * np.max(speed)) & (np.abs(one.setpoints["acceleration_m_per_s2"]) < 1e-6)
