@@ -8,7 +8,7 @@ import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +22,7 @@ from stagectl.service.places import default_socket
 _TIMEOUT_S = 5.0
 _WAIT_S = 5.0
 _RENEWALS_PER_LEASE = 4
+_BLOCK_COUNT = 50
 _REST_S, _LOOK_S = 30.0, 0.05
 _WITHOUT_POWER = ("off", "idle", "fault")
 _KINDS = {kind.__name__: kind for kind in (DriveError, LinkError, ProfileError, RecordError, RequestError, TimingError)}
@@ -31,6 +32,18 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 def error_of(failure: messages.Failure) -> StagectlError:
     """Return the error that the service tells of."""
     return _KINDS.get(failure.kind, RequestError)(failure.message)
+
+
+def _blocks(positions_m: Iterable[float]) -> Iterator[tuple[list[float], bool]]:
+    """Cut positions into what goes in one request, and say which is the last."""
+    positions, block = iter(positions_m), list[float]()
+    for position_m in positions:
+        if len(block) == _BLOCK_COUNT:
+            yield block, False
+            block = []
+        block.append(float(position_m))
+    if block:
+        yield block, True
 
 
 class Client:
@@ -169,6 +182,57 @@ class Client:
         body = messages.JogAt(velocity_m_per_s=velocity_m_per_s, hold_s=hold_s)
         return messages.Command.model_validate(self._ask("PUT", "/v1/jog", body))
 
+    def scan(self, program: messages.Scan) -> messages.Command:
+        """Follow a scan program and wait for its end."""
+        return self.do("scan", program)
+
+    def follow(self, table: Path | str, name: str = "", law: messages.LawName | None = None) -> messages.Command:
+        """Follow a CSV file (`t_s,position_m`) and wait for its end; RequestError where it can't be read."""
+        path = Path(table)
+        try:
+            text = path.read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
+            raise RequestError(f"trajectory {path}: {error}; give a readable CSV file") from error
+        return self.do("follow", messages.Follow(text=text, name=name or "trajectory", law=law))
+
+    def send_setpoints(
+        self, first_number: int, period_s: float, position_m: list[float], last: bool = False
+    ) -> messages.StreamState:
+        """Send set-points ahead, numbered from 0; the answer says what must come next and how many have room."""
+        body = messages.Setpoints(first_number=first_number, period_s=period_s, position_m=position_m, last=last)
+        return messages.StreamState.model_validate(self._ask("PUT", "/v1/setpoints", body))
+
+    def stream_state(self) -> messages.StreamState | None:
+        """Return how the stream under way stands; None where there is none."""
+        return TypeAdapter(messages.StreamState | None).validate_python(self._ask("GET", "/v1/setpoints"))
+
+    def stream(self, positions_m: Iterable[float], period_s: float) -> messages.Command:
+        """Send positions ahead as fast as there is room, and wait for the end of the motion."""
+        state: messages.StreamState | None = None
+        blocks = _blocks(positions_m)
+        block, last = next(blocks, ([], True))
+        while block:
+            first_number = 0 if state is None else state.next_number
+            if state is not None and state.room_count < len(block):
+                time.sleep(_LOOK_S)
+                stands = self.stream_state()
+                if stands is None or stands.key != state.key:
+                    return self._ended(self.command(state.key))
+                state = stands
+                continue
+            try:
+                state = self.send_setpoints(first_number, period_s, block, last)
+            except RequestError as error:
+                if state is None or (command := self.command(state.key)).state not in ("done", "failed"):
+                    raise
+                raise RequestError(f"{error} ({command.text})") from error
+            if last:
+                break
+            block, last = next(blocks, ([], True))
+        if state is None:
+            raise RequestError("there are no set-points to send; give one or more")
+        return self._ended(self.command(state.key))
+
     def stop(self) -> messages.Status:
         """Bring the stage to rest and take the power away; needs no lease."""
         return messages.Status.model_validate(self._ask("POST", "/v1/stop"))
@@ -193,7 +257,9 @@ class Client:
 
     def do(self, name: str, body: BaseModel) -> messages.Command:
         """Send a command and wait for its end. Errors: what the service says; a stop by itself is no error."""
-        found = self.begin(name, body)
+        return self._ended(self.begin(name, body))
+
+    def _ended(self, found: messages.Command) -> messages.Command:
         while found.state not in ("done", "failed"):
             found = self.command(found.key, _WAIT_S)
         if found.error is not None:

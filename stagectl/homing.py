@@ -5,10 +5,10 @@ import math
 from drivers import cia402
 from stagectl import trajectory as trajectories
 from stagectl.errors import DriveError, RequestError
-from stagectl.motion import Motion
 from stagectl.outcome import BacklashEstimate, Outcome
 from stagectl.requests import Mode, Phase
 from stagectl.signals import Stop
+from stagectl.stream_motion import StreamMotion
 from stagectl.touch_sweep import (
     IDENTIFY_HZ,
     IDENTIFY_SHARE,
@@ -25,7 +25,7 @@ _TOUCH_TRIES = 4
 _JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
 
 
-class Homing(Motion):
+class Homing(StreamMotion):
     """A stage that can be homed and identified."""
 
     def home(self) -> Outcome:

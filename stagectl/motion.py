@@ -13,7 +13,9 @@ from stagectl import trajectory as trajectories
 from stagectl.backend import SEGMENT_ROWS
 from stagectl.errors import RequestError, TimingError
 from stagectl.outcome import BacklashEstimate, Outcome
+from stagectl.profile import Profile
 from stagectl.requests import Phase
+from stagectl.scan import Program
 from stagectl.session import Session
 from stagectl.signals import SETPOINT, Stop
 from stagectl.tracker import LAW_NAMES
@@ -24,16 +26,48 @@ PLAN_SHARE = 0.9
 _JERK_TIME_S = 0.1
 
 
+def planned_limits(profile: Profile) -> trajectories.Limits:
+    """Return what planned moves, scans and streams keep to."""
+    macro = profile.macro
+    acceleration = PLAN_SHARE * min(macro.acceleration_limit_m_per_s2, 0.5 * macro.stop_deceleration_m_per_s2)
+    return trajectories.Limits(PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S)
+
+
+def check(planned: trajectories.Trajectory, profile: Profile) -> None:
+    """Refuse what a stage of this profile can't follow: RequestError names instant, value, limit and remedy."""
+    macro = profile.macro
+    trajectories.check(
+        planned,
+        macro.travel_m,
+        macro.velocity_limit_m_per_s,
+        macro.acceleration_limit_m_per_s2,
+        stop_deceleration_m_per_s2=macro.stop_deceleration_m_per_s2,
+    )
+
+
 class Motion(Session):
     """A session that can move."""
 
     _segment_number = 0
     _segment_free = 0
 
-    def follow(self, setpoints: np.ndarray, name: str, law: str | None = None) -> Outcome:
-        """Run a segment of SETPOINT rows that begins where the stage holds; returns how it ended."""
-        if setpoints.size > SEGMENT_ROWS:
-            raise RequestError(f"{name}: {setpoints.size} setpoints, {SEGMENT_ROWS} fit; split the trajectory")
+    def follow(
+        self,
+        setpoints: np.ndarray,
+        name: str,
+        law: str | None = None,
+        again: np.ndarray | None = None,
+        again_count: int = 0,
+    ) -> Outcome:
+        """Run a segment of SETPOINT rows that begins where the stage holds; returns how it ended.
+
+        `again` follows it without a pause, `again_count` times; both end at rest.
+        """
+        again_count = 0 if again is None else again_count
+        most = SEGMENT_ROWS // (3 if again_count else 1)  # three in turn never overwrite the one under way
+        longest = max(setpoints.size, again.size if again is not None else 0)
+        if longest > most:
+            raise RequestError(f"{name}: {longest} setpoints, {most} fit; split the trajectory")
         for field in SETPOINT.names or ():
             odd = np.flatnonzero(~np.isfinite(setpoints[field]))
             if odd.size:
@@ -50,8 +84,10 @@ class Motion(Session):
         if not away_m <= 1e-6:
             raise RequestError(f"{name} begins {away_m:g} m from where the stage holds; move there first")
         first_row = self.recorder.rows_count
-        number = self._begin_segment(setpoints, name, law)
-        duration_s = setpoints.size / self.profile.cycle.rate_hz
+        number = newest = self._begin_segment(setpoints, name, law)
+        under_way, left_count = setpoints, again_count
+        rows_count = setpoints.size + (0 if again is None else again_count * again.size)
+        duration_s = rows_count / self.profile.cycle.rate_hz
         until_t_ns = self.link.now_t_ns() + round((duration_s * 1.5 + 5.0) * 1e9)
         while True:
             status = self.pump()
@@ -59,16 +95,24 @@ class Motion(Session):
                 status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "coming to rest")
                 stop = Stop(int(status["stop"]))
                 break
-            if status["segment_number"] == number and status["segment_left_rows"] <= 0:
+            if again is not None and status["segment_number"] == newest:
+                if newest != number:
+                    number, under_way = newest, again
+                if left_count > 0:
+                    newest = self._begin_segment(again, name, law, at_row=under_way.size)
+                    left_count -= 1
+            if status["segment_number"] == newest and status["segment_left_rows"] <= 0:
                 stop = Stop.FINISHED
                 break
             if self.link.now_t_ns() > until_t_ns:
                 raise TimingError(
                     f"{name}: not done after {duration_s * 1.5 + 5.0:g} s; is the sensor's rate_hz right?"
                 )
-            self._progress(name, 1.0 - float(status["segment_left_rows"]) / setpoints.size)
+            to_come = left_count + (newest != number)
+            left_rows = float(status["segment_left_rows"]) + (0 if again is None else to_come * again.size)
+            self._progress(name, 1.0 - left_rows / rows_count)
         detail = "" if stop is Stop.FINISHED else self.detail
-        self._event("segment_end", number=number, stop=stop.name, **({"detail": detail} if detail else {}))
+        self._event("segment_end", number=newest, stop=stop.name, **({"detail": detail} if detail else {}))
         return self._outcome(name, stop, first_row, self._backlash(status))
 
     def _begin_segment(self, setpoints: np.ndarray, name: str, law: str | None = None, at_row: int = 0) -> int:
@@ -100,9 +144,7 @@ class Motion(Session):
         )
 
     def _limits(self) -> trajectories.Limits:
-        macro = self.profile.macro
-        acceleration = PLAN_SHARE * min(macro.acceleration_limit_m_per_s2, 0.5 * macro.stop_deceleration_m_per_s2)
-        return trajectories.Limits(PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S)
+        return planned_limits(self.profile)
 
     def move(self, target_m: float, law: str | None = None) -> Outcome:
         """Move the end to a position, jerk-limited; checked before the first cycle."""
@@ -173,14 +215,7 @@ class Motion(Session):
         return position_m >= high_m - 1e-6 if velocity_m_per_s > 0.0 else position_m <= low_m + 1e-6
 
     def _check(self, planned: trajectories.Trajectory) -> None:
-        macro = self.profile.macro
-        trajectories.check(
-            planned,
-            macro.travel_m,
-            macro.velocity_limit_m_per_s,
-            macro.acceleration_limit_m_per_s2,
-            stop_deceleration_m_per_s2=macro.stop_deceleration_m_per_s2,
-        )
+        check(planned, self.profile)
 
     def _centre(self, status: np.void) -> None:
         """Bring the macro to the middle of the gap, the end at rest, by a fifth-order polynomial."""
@@ -197,10 +232,20 @@ class Motion(Session):
         rows["relative_acceleration_m_per_s2"] = -relative_m * (60 * u - 180 * u**2 + 120 * u**3) / duration_s**2
         self.follow(rows, "centring")
 
-    def run(self, planned: trajectories.Trajectory, law: str) -> Outcome:
+    def run(self, planned: trajectories.Trajectory, law: str | None = None) -> Outcome:
         """Move to a trajectory's start, then follow it under a law."""
         self._check(planned)
         there = self.move(float(planned.setpoints["position_m"][0]), law)
         if not there.finished:
             return there
-        return self.follow(planned.setpoints, f"{planned.name} under {law}", law)
+        under = f" under {law}" if law else ""
+        return self.follow(planned.setpoints, f"{planned.name}{under}", law)
+
+    def scan(self, program: Program, law: str | None = None) -> Outcome:
+        """Move to a scan program's start, then follow all of its repetitions."""
+        self._check(program.first)
+        self._check(program.again)
+        there = self.move(float(program.first.setpoints["position_m"][0]), law)
+        if not there.finished:
+            return there
+        return self.follow(program.first.setpoints, "scanning", law, program.again.setpoints, program.again_count)

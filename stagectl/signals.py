@@ -99,6 +99,7 @@ class Stop(IntEnum):
     HEARTBEAT_LOST = 22
     RECORD_LOST = 23
     SAMPLE_AHEAD = 24
+    STARVED = 25
 
 
 STOP_TEXT = {
@@ -127,6 +128,7 @@ STOP_TEXT = {
     Stop.HEARTBEAT_LOST: "a drive sends no heartbeat",
     Stop.RECORD_LOST: "the run can't be written to its disk",
     Stop.SAMPLE_AHEAD: "the newest interferometer sample lies in the future",
+    Stop.STARVED: "the set-points did not come in time: the stage braked to rest and holds",
 }
 
 

@@ -4,6 +4,7 @@ Pure; knows no stage, no bus and no clock. Every derivative is the exact derivat
 """
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -59,6 +60,16 @@ class MotionState:
     position_m: float
     velocity_m_per_s: float = 0.0
     acceleration_m_per_s2: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Waypoint:
+    """Where one part of a chain ends, and how fast it may go on the way there."""
+
+    target_m: float
+    velocity_m_per_s: float
+    pass_velocity_m_per_s: float = 0.0
+    dwell_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +226,45 @@ def brake(start: MotionState, limits: Limits, dt_s: float = 1e-3) -> Trajectory:
     return Trajectory("brake", parameters, dt_s, setpoints)
 
 
+def chain(
+    start_m: float, waypoints: Sequence[Waypoint], limits: Limits, dt_s: float = 1e-3, name: str = "chain"
+) -> Trajectory:
+    """From rest at `start_m` from waypoint to waypoint, each part the fastest within its velocity and `limits`.
+
+    A part begins at the instant and in the state in which the one before ends, not at the next row.
+    """
+    knots: list[np.ndarray] = []
+    parts: list[np.ndarray] = []
+    state, begin_s = MotionState(start_m), 0.0
+    for i, point in enumerate(waypoints):
+        slower = Limits(point.velocity_m_per_s, limits.acceleration_m_per_s2, limits.jerk_m_per_s3)
+        planned = _planned_from(state, slower)
+        planned.target_position = [_finite(f"segments[{i}].target_m", point.target_m)]
+        planned.target_velocity = [_finite(f"segments[{i}].pass_velocity_m_per_s", point.pass_velocity_m_per_s)]
+        plan = _plan(planned, f"segments[{i}]: no way from {state} to {point}")
+        knots_s, states = _planned_phases(plan, point.target_m)
+        end_s = begin_s + float(knots_s[-1])
+        moves = knots_s[-1] > 0.0
+        knots.append(begin_s + knots_s[: -1 if moves else 0])
+        parts.append(states[: -1 if moves else 0])
+        state = MotionState(point.target_m, point.pass_velocity_m_per_s)
+        if point.dwell_s > 0.0:
+            knots.append(np.array([end_s]))
+            parts.append(np.array([[point.target_m, 0.0, 0.0, 0.0, 0.0, 0.0]]))
+        begin_s = end_s + point.dwell_s
+    end_m = state.position_m
+    knots.append(np.array([begin_s]))
+    parts.append(np.array([[end_m, 0.0, 0.0, 0.0, 0.0, 0.0]]))
+    t_s = _grid(max(begin_s, dt_s), dt_s)
+    setpoints = _table(t_s.size)
+    values = _evaluate(np.concatenate(knots), np.concatenate(parts), t_s)
+    for column, value in zip(_COLUMNS, values, strict=True):
+        setpoints[column] = value
+    _end_at_rest(setpoints, end_m)
+    parameters = {"kind": "chain", "start_m": start_m, "segments_count": len(waypoints), "dt_s": dt_s}
+    return Trajectory(name, parameters, dt_s, setpoints)
+
+
 def _planned_from(state: MotionState, limits: Limits) -> ruckig.InputParameter:
     planned = ruckig.InputParameter(1)
     planned.current_position = [_finite("start position_m", state.position_m)]
@@ -228,13 +278,7 @@ def _planned_from(state: MotionState, limits: Limits) -> ruckig.InputParameter:
 
 def _calculated(planned: ruckig.InputParameter, refusal: str, dt_s: float, target_m: float | None = None) -> np.ndarray:
     """Return the setpoints of a plan that ends at rest, at `target_m` or where braking ends."""
-    plan = ruckig.Trajectory(1)
-    try:
-        result = ruckig.Ruckig(1).calculate(planned, plan)
-    except ruckig.RuckigError as error:
-        raise RequestError(f"{refusal}: {error}; widen the limits") from error
-    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise RequestError(f"{refusal}: {result}; widen the limits")
+    plan = _plan(planned, refusal)
     end_m = float(plan.at_time(plan.duration)[0][0]) if target_m is None else target_m
     knots_s, states = _planned_phases(plan, end_m)
     t_s = _grid(max(float(knots_s[-1]), dt_s), dt_s)
@@ -243,6 +287,17 @@ def _calculated(planned: ruckig.InputParameter, refusal: str, dt_s: float, targe
         setpoints[column] = values
     _end_at_rest(setpoints, end_m)
     return setpoints
+
+
+def _plan(planned: ruckig.InputParameter, refusal: str) -> ruckig.Trajectory:
+    plan = ruckig.Trajectory(1)
+    try:
+        result = ruckig.Ruckig(1).calculate(planned, plan)
+    except ruckig.RuckigError as error:
+        raise RequestError(f"{refusal}: {error}; widen the limits") from error
+    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise RequestError(f"{refusal}: {result}; widen the limits")
+    return plan
 
 
 def from_table(t_s: np.ndarray, position_m: np.ndarray, dt_s: float = 1e-3, name: str = "table") -> Trajectory:
@@ -283,25 +338,44 @@ def from_table(t_s: np.ndarray, position_m: np.ndarray, dt_s: float = 1e-3, name
 def from_file(path: str | Path, dt_s: float = 1e-3) -> Trajectory:
     """Read a CSV file with the header `t_s,position_m` and smooth it as `from_table` does."""
     file = Path(path)
-    header = ["t_s", "position_m"]
     try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        text = file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
         raise RequestError(
             f"trajectory {file}: {error}; give a readable CSV file with the header t_s,position_m"
         ) from error
+    return from_text(text, dt_s, file.stem, str(file))
+
+
+def from_text(text: str, dt_s: float = 1e-3, name: str = "table", place: str = "") -> Trajectory:
+    """Read CSV with the header `t_s,position_m` and smooth it as `from_table` does; `place` is where it is from."""
+    place = place or f"'{name}'"
+    header = ["t_s", "position_m"]
+    try:
+        rows = [row for row in csv.reader(io.StringIO(text.removeprefix("\ufeff"))) if row]
+    except csv.Error as error:
+        raise RequestError(f"trajectory {place}: {error}; give CSV with the header t_s,position_m") from error
     if not rows or [cell.strip() for cell in rows[0]] != header:
-        found = ",".join(rows[0]) if rows else "nothing"
-        raise RequestError(f"trajectory {file}, line 1: the header is {found!r}; it must be 't_s,position_m'")
+        found = ",".join(rows[0])[:60] if rows else "nothing"
+        raise RequestError(
+            f"trajectory {place}, line 1: the header is {found!r}; it must be 't_s,position_m'{_other_units(found)}"
+        )
     values = np.empty((len(rows) - 1, 2))
     for i, row in enumerate(rows[1:]):
         try:
             at_s, position_m = row
             values[i] = float(at_s), float(position_m)
         except ValueError as error:
-            raise RequestError(f"trajectory {file}, row {i + 1}: {','.join(row)!r}; two numbers are needed") from error
-    return from_table(values[:, 0], values[:, 1], dt_s, file.stem)
+            raise RequestError(
+                f"trajectory {place}, row {i + 1}: {','.join(row)[:60]!r}; two numbers are needed"
+            ) from error
+    return from_table(values[:, 0], values[:, 1], dt_s, name)
+
+
+def _other_units(header: str) -> str:
+    """Say what to do with a header that names other units."""
+    other = [unit for unit in ("ms", "us", "min", "mm", "um", "nm", "inch") if f"_{unit}" in header.lower()]
+    return f"; it says {', '.join(other)}: convert times to seconds, positions to metres" if other else ""
 
 
 def check(
@@ -566,12 +640,25 @@ def _spline(t_s: np.ndarray, position_m: np.ndarray) -> tuple[np.ndarray, np.nda
     slopes = np.zeros((n, 2))
     for i in range(n - 2, 0, -1):
         slopes[i] = shift[i] - gain[i] @ slopes[i + 1]
-    v, a = slopes[:, 0], slopes[:, 1]
-    v0, v1, a0, a1 = v[:-1] * h, v[1:] * h, a[:-1] * h**2, a[1:] * h**2
-    states = np.zeros((n, 6))
-    states[:, 0], states[:, 1], states[:, 2] = position_m, v / unit_s, a / unit_s**2
-    step_s = h * unit_s
+    return t_s, _quintics(t_s, position_m, slopes[:, 0] / unit_s, slopes[:, 1] / unit_s**2)
+
+
+def through_states(t_s: np.ndarray, p_m: np.ndarray, v_m_per_s: np.ndarray, a_m_per_s2: np.ndarray, at_s: np.ndarray):
+    """Return SETPOINT rows at `at_s` of the quintics that go through states at `t_s`, all shape (n,)."""
+    setpoints = _table(at_s.size)
+    states = _quintics(t_s, p_m, v_m_per_s, a_m_per_s2)
+    for column, values in zip(_COLUMNS, _evaluate(t_s, states, at_s), strict=True):
+        setpoints[column] = values
+    return setpoints
+
+
+def _quintics(t_s: np.ndarray, position_m: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Derivatives 0 .. 5 just after every knot, shape (n, 6), of quintics through position, velocity, acceleration."""
+    step_s, rise = np.diff(t_s), np.diff(position_m)
+    v0, v1, a0, a1 = v[:-1] * step_s, v[1:] * step_s, a[:-1] * step_s**2, a[1:] * step_s**2
+    states = np.zeros((t_s.size, 6))
+    states[:, 0], states[:, 1], states[:, 2] = position_m, v, a
     states[:-1, 3] = (60.0 * rise - 36.0 * v0 - 24.0 * v1 - 9.0 * a0 + 3.0 * a1) / (step_s * step_s**2)
     states[:-1, 4] = (-360.0 * rise + 192.0 * v0 + 168.0 * v1 + 36.0 * a0 - 24.0 * a1) / (step_s**2 * step_s**2)
     states[:-1, 5] = (720.0 * rise - 360.0 * (v0 + v1) - 60.0 * (a0 - a1)) / (step_s * step_s**2 * step_s**2)
-    return t_s, states
+    return states

@@ -78,11 +78,11 @@ def motion(
         _refuse_other(status, profile, usual_profile, backend)
         voice.note(f"{status.profile} through the service: {status.banner}")
         with leased(stage, token):
-            command = _prepared(voice, stage, status, name)
+            command = prepared(voice, stage, status, name)
             if command is None:
                 command = follow(voice, stage, name, body)
         at_rest = stage.status()
-    return _answer(command, at_rest)
+    return answered(command, at_rest)
 
 
 def _refuse_other(status: messages.Status, profile: str, usual_profile: str, backend: str) -> None:
@@ -101,7 +101,7 @@ def _refuse_other(status: messages.Status, profile: str, usual_profile: str, bac
         )
 
 
-def _prepared(voice: Voice, stage: Client, status: messages.Status, name: str) -> messages.Command | None:
+def prepared(voice: Voice, stage: Client, status: messages.Status, name: str) -> messages.Command | None:
     """Home and arm; returns what went wrong, None where the stage holds."""
     if name == "home":
         return None
@@ -128,7 +128,7 @@ def follow(voice: Voice, stage: Client, name: str, body: BaseModel) -> messages.
     return found
 
 
-def _answer(command: messages.Command, status: messages.Status) -> Answer:
+def answered(command: messages.Command, status: messages.Status) -> Answer:
     finished = command.stop in ("", _FINISHED)
     text = f"{command.name}: {command.text}"
     shown: list[RenderableType] = [escape(text) if finished else f"[red]ended early[/]: {escape(text)}"]

@@ -44,6 +44,11 @@ Hold = Annotated[bool, option("Take the lease and hold it until Ctrl-C.", "--hol
 RecordName = Annotated[str | None, option("Begin a run of this name.", "--name", metavar="NAME")]
 EndRecord = Annotated[bool, option("End the run that was asked for.", "--end")]
 World = Annotated[str | None, typer.Argument(help="auto | hardware | rig.", metavar="[WORLD]")]
+ScanFile = Annotated[Path, typer.Argument(help="TOML: repeat_count, start_m, [[segments]].", metavar="PROGRAM.toml")]
+TableFile = Annotated[Path, typer.Argument(help="CSV with the header t_s,position_m.", metavar="FILE.csv")]
+Period = Annotated[float, option("Time from one position to the next, s.", "--period-s", min=1e-4, max=1.0)]
+Law = Annotated[str | None, option("Control law: dsmc | pid (default: the profile's).", "--law", metavar="LAW")]
+_USUAL_PROFILE = "oled-printer"
 
 
 @service_app.command(
@@ -121,3 +126,26 @@ def record(name: RecordName = None, end: EndRecord = False, socket: Socket = Non
 def log(lines: LinesCount = 30, socket: Socket = None, json: Json = False) -> None:
     """Show what the service did last."""
     deliver("log", json, lambda voice: commands.remote.log(voice, socket, lines), compiles=False)
+
+
+@service_app.command(epilog=epilog("stagectl scan raster.toml"))
+def scan(program: ScanFile, lease: LeaseToken = None, socket: Socket = None, json: Json = False) -> None:
+    """Follow a scan program: segments, dwells, repetitions; checked whole before the first cycle."""
+    work = commands.planned_motion.scan
+    deliver("scan", json, lambda voice: work(voice, socket, lease, _USUAL_PROFILE, program), compiles=False)
+
+
+@service_app.command(epilog=epilog("stagectl follow motion.csv"))
+def follow(
+    table: TableFile, law: Law = None, lease: LeaseToken = None, socket: Socket = None, json: Json = False
+) -> None:
+    """Follow the motion of a file, smoothed and checked before the first cycle."""
+    work = commands.planned_motion.follow
+    deliver("follow", json, lambda voice: work(voice, socket, lease, _USUAL_PROFILE, table, law), compiles=False)
+
+
+@service_app.command(epilog=epilog("my-program | stagectl stream --period-s 0.01"))
+def stream(period_s: Period = 0.01, lease: LeaseToken = None, socket: Socket = None, json: Json = False) -> None:
+    """Follow positions from standard input, one a line; where none comes in time, the stage brakes."""
+    work = commands.planned_motion.stream
+    deliver("stream", json, lambda voice: work(voice, socket, lease, period_s), compiles=False)

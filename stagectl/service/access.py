@@ -20,6 +20,10 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 Application = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 BODY_LIMIT_BYTES = 64 * 1024
+TABLE_LIMIT_BYTES = 2 * 1024 * 1024
+"""For a motion's table, on its own path."""
+
+_TABLE_PATH = "/v1/follow"
 _TOKEN_BYTES = 24
 _LEAST_TOKEN_LETTERS = 20
 
@@ -98,8 +102,9 @@ async def let_in(application: Application, role: Role, scope: Scope, receive: Re
     """Pass a connection on with its role, unless its body is above the limit."""
     scope["stagectl_role"] = role
     length = header(scope, b"content-length")
-    if length and (not length.isdigit() or int(length) > BODY_LIMIT_BYTES):
-        await refuse(scope, send, 413, f"Content-Length {length[:20]}: the limit is {BODY_LIMIT_BYTES} bytes")
+    most = TABLE_LIMIT_BYTES if scope.get("path") == _TABLE_PATH and role is Role.OPERATE else BODY_LIMIT_BYTES
+    if length and (not length.isdigit() or int(length) > most):
+        await refuse(scope, send, 413, f"Content-Length {length[:20]}: the limit is {most} bytes")
         return
     if scope["type"] == "http" and not length and header(scope, b"transfer-encoding"):
         await refuse(scope, send, 411, "send a Content-Length; bodies in pieces are not taken")

@@ -187,6 +187,15 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
         take.__name__ = name
         app.post(f"/v1/{name}", status_code=202, dependencies=_OPERATES)(take)
 
+    def planner(name: str, model: type, text: str) -> None:
+        def take(body: Any, key: IdempotencyKey = None, token: LeaseToken = "") -> messages.Command:
+            return desk.submit_planned(name, body, key or f"made-{secrets.token_hex(12)}", token)
+
+        take.__annotations__["body"] = model
+        take.__doc__ = text
+        take.__name__ = name
+        app.post(f"/v1/{name}", status_code=202, dependencies=_OPERATES)(take)  # planned in a thread of its own
+
     taker("arm", messages.Arm, "Give the drives power and hold; the stage must be homed.")
     taker("home", messages.Home, "Home: the macro on its index, the micro on both edges; ends armed.")
     taker("move", messages.Move, "Move the end to a position.")
@@ -195,6 +204,19 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
     taker("acknowledge", messages.Acknowledge, "Take note of a fault; enables nothing.")
     taker("backend", messages.SwapBackend, "Work in another world; without power only.")
     taker("reread", messages.Home, "Read the profile again; without power only.")
+
+    planner("scan", messages.Scan, "Follow a scan program; checked against all limits before the first cycle.")
+    planner("follow", messages.Follow, "Follow a table of times and positions; checked before the first cycle.")
+
+    @app.get("/v1/setpoints")
+    async def stream_state() -> messages.StreamState | None:
+        """How the stream under way stands; null where there is none."""
+        return desk.stream_state()
+
+    @app.put("/v1/setpoints", status_code=202, dependencies=_OPERATES)
+    def setpoints(body: messages.Setpoints, token: LeaseToken = "") -> messages.StreamState:
+        """Send set-points ahead; number 0 begins. Where none comes in time the stage brakes and holds."""
+        return desk.take_setpoints(body, token)
 
     @app.put("/v1/jog", status_code=202, dependencies=_OPERATES)
     async def jog_at(body: messages.JogAt, token: LeaseToken = "") -> messages.Command:

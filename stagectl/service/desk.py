@@ -3,24 +3,26 @@
 Any thread may call it; nothing here touches the stage. The stage's thread takes orders and publishes.
 """
 
+import contextlib
 import math
 import secrets
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from stagectl.errors import RequestError, StagectlError
 from stagectl.profile import Profile
 from stagectl.service import lease as leases
-from stagectl.service import messages, states
+from stagectl.service import messages, plans, states
 from stagectl.service.lease import Lease
 from stagectl.service.motions import MOTIONS
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import State
 from stagectl.service.view import jog_velocity_m_per_s
+from stagectl.streaming import SetpointBuffer
 
 _KEPT_ORDERS_COUNT = 1000
 
@@ -40,9 +42,20 @@ class Ending(RequestError):
 class Order:
     """A command on its way through the service."""
 
-    def __init__(self, key: str, name: str, body: Any, token: str, clock_s: Callable[[], float]):
-        """Wait to be carried out."""
+    def __init__(
+        self,
+        key: str,
+        name: str,
+        body: Any,
+        token: str,
+        clock_s: Callable[[], float],
+        plan: plans.Plan | None = None,
+    ):
+        """Wait to be carried out; `plan` is what was planned for it."""
         self.key, self.name, self.body, self.token = key, name, body, token
+        self.plan: Any = None if plan is None else plan.motion
+        """What was planned for it, until it is over."""
+        self._remark = "" if plan is None else plan.remark
         self._clock_s = clock_s
         self._message = messages.Command(key=key, name=name, state="waiting", share=0.0, at=now_text())
         self._velocity_m_per_s, self._until_s = 0.0, -math.inf
@@ -67,10 +80,13 @@ class Order:
 
     def finish(self, text: str, stop: str, run: str, backlash: messages.Backlash | None) -> None:
         """It came to an end; `stop` says which."""
+        text = f"{text}. {self._remark}" if self._remark else text
+        self.plan = None
         self._change(state="done", share=1.0, text=text, stop=stop, run=run, backlash=backlash)
 
     def fail(self, error: StagectlError) -> None:
         """It was refused, or something broke."""
+        self.plan = None
         failure = messages.Failure(kind=type(error).__name__, message=str(error))
         self._change(state="failed", text=str(error), error=failure)
 
@@ -84,6 +100,21 @@ class Order:
     def wanted_m_per_s(self) -> float | None:
         """Return the velocity that is wanted now; None where nobody holds the key any more."""
         return self._velocity_m_per_s if self._clock_s() < self._until_s else None
+
+
+@contextlib.contextmanager
+def _unfit() -> Iterator[None]:
+    """Say of what a plan refuses that the values don't fit."""
+    try:
+        yield
+    except RequestError as error:
+        raise Unfit(str(error)) from error
+
+
+def _stream_state(key: str, buffer: SetpointBuffer) -> messages.StreamState:
+    return messages.StreamState(
+        key=key, next_number=buffer.next_number, ahead_s=buffer.ahead_s, room_count=buffer.room_count
+    )
 
 
 class Desk:
@@ -233,7 +264,58 @@ class Desk:
         if waiting is not None:
             waiting.fail(Busy(f"{waiting.name}: stopped before it began: {reason}"))
 
-    def submit(self, name: str, body: Any, key: str, token: str) -> messages.Command:
+    def submit_planned(self, name: str, body: Any, key: str, token: str) -> messages.Command:
+        """Plan a scan or a table, check it, and take it over like `submit`; plans without the lock."""
+        with self._lock:
+            if key in self._orders:
+                return self.submit(name, plans.kept(body), key, token)
+        profile, holds_m = self._where_it_holds(name, token)
+        with _unfit():
+            plan = plans.scanned(body, profile, holds_m) if name == "scan" else plans.followed(body, profile)
+        return self.submit(name, plans.kept(body), key, token, plan)
+
+    def take_setpoints(self, body: messages.Setpoints, token: str) -> messages.StreamState:
+        """Begin a stream, or take what goes on with it. Errors: RequestError and kinds; then none of it is taken."""
+        with self._lock:
+            leases.holds(self._lease, token, self._clock_s())
+            order = self._current
+            known = order.plan if order is not None and order.name == "setpoints" and not order.over else None
+            if known is not None and self._stop.is_set():
+                raise Busy("the stage is coming to rest; wait until it stands")
+        if order is not None and known is not None:
+            with _unfit():
+                if body.period_s != order.body.period_s:
+                    raise RequestError(f"period_s is {body.period_s:g}, the stream began with {order.body.period_s:g}")
+                known.take(body.first_number, body.position_m, body.last)
+            return _stream_state(order.key, known)
+        if body.first_number != 0:
+            raise Unfit(f"set-point {body.first_number} comes too late: no stream is under way; begin with number 0")
+        profile, holds_m = self._where_it_holds("setpoints", token)
+        with _unfit():
+            plan = plans.streamed(body, profile, holds_m)
+        command = self.submit("setpoints", plans.kept(body), f"stream-{secrets.token_hex(8)}", token, plan)
+        return _stream_state(command.key, plan.motion)
+
+    def stream_state(self) -> messages.StreamState | None:
+        """Say how the stream under way stands; None where there is none."""
+        with self._lock:
+            order = self._current
+            buffer = order.plan if order is not None and order.name == "setpoints" else None
+            return None if order is None or buffer is None else _stream_state(order.key, buffer)
+
+    def _where_it_holds(self, name: str, token: str) -> tuple[Profile, float]:
+        """Return profile and reference of a stage that can move now. Errors: RequestError and kinds."""
+        with self._lock:
+            self._refuse_when_closed()
+            leases.holds(self._lease, token, self._clock_s())
+            profile, status = self.profile, self._status
+            states.after(self._state, MOTIONS[name].event)
+        holds_m = None if status is None else status.positions.setpoint_position_m
+        if profile is None or holds_m is None:
+            raise RequestError(f"{name}: the stage is not connected; `stagectl status` says what it waits for")
+        return profile, holds_m
+
+    def submit(self, name: str, body: Any, key: str, token: str, plan: plans.Plan | None = None) -> messages.Command:
         """Take a command over, or return what became of it where its key was seen. Errors: RequestError and kinds."""
         with self._lock:
             known = self._orders.get(key)
@@ -247,7 +329,7 @@ class Desk:
             if name in MOTIONS:
                 states.after(self._state, MOTIONS[name].event)
             self._check_values(name, body)
-            order = Order(key, name, body, token, self._clock_s)
+            order = Order(key, name, body, token, self._clock_s, plan)
             if name == "jog_at":
                 order.hold(body.velocity_m_per_s, body.hold_s)
             self._keep_order(order)

@@ -61,6 +61,68 @@ class Identify(_Asked):
     duration_s: Annotated[Finite, Field(ge=2.0, le=240.0)] = 20.0
 
 
+class Segment(_Asked):
+    """One part of a scan: to a position, there at rest for `dwell_s`, or passing it without a stop."""
+
+    target_m: Annotated[Finite, Field(ge=-100.0, le=100.0)]
+    velocity_m_per_s: Annotated[Finite, Field(gt=0.0, le=20.0)] | None = None
+    """At most; without it, as fast as a move."""
+    pass_velocity_m_per_s: Annotated[Finite, Field(ge=-20.0, le=20.0)] = 0.0
+    """With which the target is passed, signed: the next segment goes on from there."""
+    dwell_s: Annotated[Finite, Field(ge=0.0, le=3600.0)] = 0.0
+
+
+class Scan(_Asked):
+    """A scan program: its segments one after the other, `repeat_count` times; begins at `start_m`, or where it is."""
+
+    segments: Annotated[list[Segment], Field(min_length=1, max_length=200)]
+    repeat_count: Annotated[int, Field(ge=1, le=10**6)] = 1
+    start_m: Annotated[Finite, Field(ge=-100.0, le=100.0)] | None = None
+    law: LawName | None = None
+
+
+class Follow(_Asked):
+    """A motion over time: CSV with the header `t_s,position_m`, smoothed by a quintic spline, at rest at its ends."""
+
+    text: Annotated[str, Field(min_length=1, max_length=2_000_000)]
+    name: RunName = "trajectory"
+    law: LawName | None = None
+
+
+class Followed(BaseModel):
+    """What is kept of such a motion's request."""
+
+    name: str
+    law: LawName | None
+    sha256: str
+
+
+class Setpoints(_Asked):
+    """Positions `period_s` apart, ahead of time, numbered from 0; number 0 is where the stage holds and begins."""
+
+    first_number: Annotated[int, Field(ge=0, le=10**12)]
+    period_s: Annotated[Finite, Field(ge=1e-4, le=1.0)]
+    position_m: Annotated[list[Finite], Field(min_length=1, max_length=2000)]
+    last: bool = False
+    """Whether the stage comes to rest behind these."""
+
+
+class StreamBegun(BaseModel):
+    """What is kept of the request that began a stream."""
+
+    period_s: float
+
+
+class StreamState(BaseModel):
+    """How a stream stands: what must come next, for how long there is enough, how many have room."""
+
+    key: str
+    """Of the command; says what became of it."""
+    next_number: int
+    ahead_s: float
+    room_count: int
+
+
 class SwapBackend(_Asked):
     """Work in another world; only without power."""
 

@@ -8,7 +8,7 @@ from stagectl.service.states import Event
 from stagectl.supervisor import Supervisor
 
 Work = Callable[[Supervisor, Any], Outcome]
-"""Takes the stage and the order (body, and for a jog what is wanted now)."""
+"""Takes the stage and the order (body, its plan where it has one, and for a jog what is wanted now)."""
 
 
 class Motion(NamedTuple):
@@ -30,6 +30,9 @@ MOTIONS: dict[str, Motion] = {
     "move": Motion(Event.MOVE, lambda stage, order: stage.move(order.body.target_m, order.body.law)),
     "jog": Motion(Event.MOVE, _by_distance),
     "jog_at": Motion(Event.MOVE, lambda stage, order: stage.jog(order.wanted_m_per_s)),
+    "scan": Motion(Event.MOVE, lambda stage, order: stage.scan(order.plan, order.body.law)),
+    "follow": Motion(Event.MOVE, lambda stage, order: stage.run(order.plan, order.body.law)),
+    "setpoints": Motion(Event.MOVE, lambda stage, order: stage.follow_stream(order.plan)),
     "identify": Motion(
         Event.IDENTIFY,
         lambda stage, order: stage.identify(order.body.frequency_hz, order.body.duration_s),

@@ -1,0 +1,82 @@
+"""What a request for a scan, a table or a stream becomes: a plan that was checked before anything moves. Pure."""
+
+import hashlib
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel
+
+from stagectl import scan, suspected_units
+from stagectl import trajectory as trajectories
+from stagectl.backend import SEGMENT_ROWS
+from stagectl.errors import RequestError
+from stagectl.motion import check, planned_limits
+from stagectl.profile import Profile
+from stagectl.service import messages
+from stagectl.streaming import Room, SetpointBuffer
+from stagectl.trajectory import Waypoint
+
+
+class Plan(NamedTuple):
+    """What the stage follows, and what a person should look at."""
+
+    motion: Any
+    remark: str = ""
+
+
+def kept(body: BaseModel) -> BaseModel:
+    """Return what is kept of a request: tables go by their digest."""
+    if isinstance(body, messages.Follow):
+        digest = hashlib.sha256(body.text.encode("utf-8", "backslashreplace")).hexdigest()
+        return messages.Followed(name=body.name, law=body.law, sha256=digest)
+    return messages.StreamBegun(period_s=body.period_s) if isinstance(body, messages.Setpoints) else body
+
+
+def scanned(body: messages.Scan, profile: Profile, holds_m: float) -> Plan:
+    """Plan a scan program. Errors: RequestError with segment or instant, value, limit, remedy."""
+    limits = planned_limits(profile)
+    waypoints = [
+        Waypoint(
+            part.target_m,
+            limits.velocity_m_per_s if part.velocity_m_per_s is None else part.velocity_m_per_s,
+            part.pass_velocity_m_per_s,
+            part.dwell_s,
+        )
+        for part in body.segments
+    ]
+    start_m = holds_m if body.start_m is None else body.start_m
+    program = scan.plan(start_m, waypoints, body.repeat_count, limits, profile.cycle.period_s)
+    longest = max(program.first.setpoints.size, program.again.setpoints.size)
+    if longest > SEGMENT_ROWS // 3:
+        raise RequestError(
+            f"segments: one repetition takes {longest * profile.cycle.period_s:g} s, "
+            f"{SEGMENT_ROWS // 3 * profile.cycle.period_s:g} s is the limit; give fewer segments or shorter dwells"
+        )
+    check(program.first, profile)
+    check(program.again, profile)
+    return Plan(program)
+
+
+def followed(body: messages.Follow, profile: Profile) -> Plan:
+    """Plan the motion of a table. Errors: RequestError, with the units that it seems to have."""
+    planned = trajectories.from_text(body.text, profile.cycle.period_s, body.name)
+    if planned.setpoints.size > SEGMENT_ROWS:
+        raise RequestError(
+            f"trajectory '{body.name}' takes {planned.duration_s:g} s, "
+            f"{SEGMENT_ROWS * profile.cycle.period_s:g} s is the limit; cut it in parts. "
+            + suspected_units.of_times(planned, profile.macro.velocity_limit_m_per_s)
+        )
+    try:
+        check(planned, profile)
+    except RequestError as error:
+        suspected = suspected_units.of_positions(planned, profile.macro.travel_m)
+        raise RequestError(f"{error}. {suspected}" if suspected else str(error)) from error
+    return Plan(planned, suspected_units.of_times(planned, profile.macro.velocity_limit_m_per_s))
+
+
+def streamed(body: messages.Setpoints, profile: Profile, holds_m: float) -> Plan:
+    """Begin a stream with its first set-points. Errors: RequestError with number, value, limit, remedy."""
+    macro = profile.macro
+    room = Room(macro.travel_m, planned_limits(profile), macro.stop_deceleration_m_per_s2)
+    buffer = SetpointBuffer(holds_m, body.period_s, room, profile.cycle.period_s)
+    buffer.take(0, body.position_m, body.last)
+    return Plan(buffer)
