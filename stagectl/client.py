@@ -23,6 +23,7 @@ _TIMEOUT_S = 5.0
 _WAIT_S = 5.0
 _RENEWALS_PER_LEASE = 4
 _BLOCK_COUNT = 50
+_STOP_TRIES = 3
 _REST_S, _LOOK_S = 30.0, 0.05
 _WITHOUT_POWER = ("off", "idle", "fault")
 _KINDS = {kind.__name__: kind for kind in (DriveError, LinkError, ProfileError, RecordError, RequestError, TimingError)}
@@ -234,7 +235,10 @@ class Client:
         return self._ended(self.command(state.key))
 
     def stop(self) -> messages.Status:
-        """Bring the stage to rest and take the power away; needs no lease."""
+        """Bring the stage to rest and take the power away; needs no lease. Tried again where the link fails."""
+        for _ in range(_STOP_TRIES - 1):
+            with contextlib.suppress(LinkError):
+                return messages.Status.model_validate(self._ask("POST", "/v1/stop"))
         return messages.Status.model_validate(self._ask("POST", "/v1/stop"))
 
     def record(self, name: str = "request") -> messages.Status:

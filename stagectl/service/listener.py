@@ -9,10 +9,28 @@ from typing import Literal
 import uvicorn
 
 from stagectl.service.access import Application
+from stagectl.service.admission import Admission, Connection
 
 _CLOSE_S = 2.0
-_CONNECTIONS_LIMIT = 100
 _START_S = 10.0
+
+
+def _server(application: Application, lifespan: Literal["on", "off"]) -> uvicorn.Server:
+    admission = Admission(application, lambda: len(server.server_state.connections))
+    server = uvicorn.Server(
+        uvicorn.Config(
+            admission,  # pyright: ignore[reportArgumentType]
+            http=Connection,
+            lifespan=lifespan,
+            log_config=None,
+            access_log=False,
+            ws="websockets-sansio",
+            ws_max_size=4096,
+            timeout_graceful_shutdown=int(_CLOSE_S),
+            server_header=False,
+        )
+    )
+    return server
 
 
 class Listener:
@@ -24,22 +42,7 @@ class Listener:
         `lifespan` "on": the applications are told of their beginning and end.
         """
         self._sockets = [listening for listening, _ in served]
-        self._servers = [
-            uvicorn.Server(
-                uvicorn.Config(
-                    application,  # pyright: ignore[reportArgumentType]
-                    lifespan=lifespan,
-                    log_config=None,
-                    access_log=False,
-                    ws="websockets-sansio",
-                    ws_max_size=4096,
-                    limit_concurrency=_CONNECTIONS_LIMIT,
-                    timeout_graceful_shutdown=int(_CLOSE_S),
-                    server_header=False,
-                )
-            )
-            for _, application in served
-        ]
+        self._servers = [_server(application, lifespan) for _, application in served]
         self._thread = threading.Thread(target=self._work, name="api", daemon=True)
 
     def start(self) -> None:

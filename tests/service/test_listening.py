@@ -4,15 +4,25 @@ import json
 import os
 import socket
 import stat
+import time
 
 import pytest
 
+from stagectl.client import Client
 from stagectl.errors import LinkError, ProfileError, RecordError, RequestError
 from stagectl.service import messages
-from stagectl.service.access import Role, read_tokens, role_of
+from stagectl.service.access import Access, Role, read_tokens, role_of
+from stagectl.service.admission import CONNECTIONS_LIMIT, RESERVE_COUNT
+from stagectl.service.api import application
+from stagectl.service.desk import Desk
+from stagectl.service.exposition import Figures
+from stagectl.service.listener import Listener
 from stagectl.service.notify import Notifier
 from stagectl.service.places import is_served, listen_tcp, listen_unix
 from stagectl.service.remembered import FILE, Remembered, keep, recall
+from stagectl.service.service_log import ServiceLog
+from stagectl.service.stage_loop import StageLoop
+from stagectl.service.stage_state import Settings
 
 
 def test_the_socket_is_for_owner_and_group(tmp_path):
@@ -128,3 +138,69 @@ def test_the_state_survives_and_a_damaged_one_is_said(tmp_path):
     assert sorted(os.listdir(tmp_path / "deep")) == [FILE]
     with pytest.raises(RecordError, match="can't be kept"):
         keep(path, remembered)
+
+
+class Crowd:
+    """Raw connections to a served API: silent ones, and streams."""
+
+    def __init__(self, path):
+        self.path = str(path)
+        self.sockets = []
+
+    def connect(self, sent=b""):
+        one = socket.socket(socket.AF_UNIX)
+        one.connect(self.path)
+        one.sendall(sent)
+        self.sockets.append(one)
+        return one
+
+    def close(self):
+        for one in self.sockets:
+            one.close()
+
+
+@pytest.fixture
+def crowd(tmp_path):
+    """A served API without a stage, and who crowds it: (crowd, desk, client)."""
+    path = tmp_path / "s"
+    log = ServiceLog(None)
+    desk = Desk(log)
+    loop = StageLoop(Settings("none", "rig", tmp_path, tmp_path), desk, log, Remembered(), Notifier({}), Figures())
+    loop._tick()
+    listener = Listener([(listen_unix(path), Access(application(desk, log, Figures(), tmp_path, "0"), None))])
+    listener.start()
+    made = Crowd(path)
+    with Client(path) as client:
+        yield made, desk, client
+    made.close()
+    listener.close()
+
+
+@pytest.mark.parametrize("asked", [b"", b"GET /v1/status HTTP/1.1\r\nHost: s\r\n"], ids=["silent", "half a request"])
+def test_no_crowd_keeps_a_stop_out(crowd, asked):
+    many, desk, client = crowd
+    for _ in range(CONNECTIONS_LIMIT + 3 * RESERVE_COUNT):
+        many.connect(asked)
+    with pytest.raises(RequestError, match="connections are open, the limit; close some and try again"):
+        client.status()
+    assert client.stop().state == "off"
+    assert desk.stop_asked
+    many.close()
+    for _ in range(100):
+        try:
+            assert client.status().state == "off"
+            return
+        except RequestError:
+            time.sleep(0.02)
+    raise AssertionError("still refused")
+
+
+def test_streams_up_to_the_limit_leave_room_for_a_stop(crowd):
+    many, desk, client = crowd
+    upgrade = b"GET /v1/stream HTTP/1.1\r\nHost: s\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    upgrade += b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    answers = [many.connect(upgrade).recv(12) for _ in range(CONNECTIONS_LIMIT + 20)]
+    assert answers[0] == b"HTTP/1.1 101"
+    assert answers[-1] == b"HTTP/1.1 403"
+    assert client.stop().state == "off"
+    assert desk.stop_asked

@@ -1,0 +1,61 @@
+"""How many clients there may be, and why none of them keeps a stop out.
+
+Beyond the limit everything but a stop is refused, and of the connections that ask nothing the oldest make room: so
+there is always one left for whoever wants to stop the stage. uvicorn's own limit refuses whatever comes, a stop too.
+"""
+
+import json
+from collections.abc import Callable
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from stagectl.service.access import Application, Receive, Scope, Send
+
+CONNECTIONS_LIMIT = 100
+RESERVE_COUNT = 50
+"""Beyond the limit, for stops."""
+
+_STOP_PATH = "/v1/stop"
+_TEXT = f"{CONNECTIONS_LIMIT} connections are open, the limit; close some and try again. A stop is taken always."
+
+
+class Connection(H11Protocol):
+    """A client's connection; when too many are open, the one that has asked nothing for longest is closed."""
+
+    def connection_made(self, transport) -> None:
+        """Take the connection, and make room for the next."""
+        super().connection_made(transport)
+        self.begun_s = self.loop.time()
+        if len(self.connections) > CONNECTIONS_LIMIT + RESERVE_COUNT:
+            others = [one for one in self.connections if isinstance(one, Connection) and one is not self]
+            silent = [one for one in others if one.is_silent]
+            if silent:
+                min(silent, key=lambda one: one.begun_s).transport.close()
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing that was asked here waits for its answer."""
+        return (self.cycle is None or self.cycle.response_complete) and not self.transport.is_closing()
+
+
+class Admission:
+    """Refuses whatever comes over one connection too many, but for a stop."""
+
+    def __init__(self, application: Application, connections_count: Callable[[], int]):
+        """`connections_count` says how many are open now."""
+        self._application, self._connections_count = application, connections_count
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one request on, or refuse it."""
+        is_stop = scope["type"] == "http" and scope.get("path") == _STOP_PATH and scope.get("method") == "POST"
+        is_client = scope["type"] in ("http", "websocket")
+        if is_stop or not is_client or self._connections_count() <= CONNECTIONS_LIMIT:
+            await self._application(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1013, "reason": _TEXT[:120]})
+        else:
+            body = json.dumps({"kind": "Busy", "message": _TEXT}).encode()
+            headers = [(b"content-type", b"application/json"), (b"connection", b"close")]
+            headers.append((b"content-length", str(len(body)).encode()))
+            await send({"type": "http.response.start", "status": 503, "headers": headers})
+            await send({"type": "http.response.body", "body": body})
