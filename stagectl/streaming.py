@@ -25,6 +25,7 @@ AHEAD_LEAST_S = 0.3
 
 _START_TOLERANCE_M = 1e-6
 _LEAST_COUNT = 64
+_SMOOTHER = "send a smoother motion"
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,27 +146,23 @@ class SetpointBuffer:
         room, limits = self._room, self._room.limits
         (low_m, high_m), top, hardest = room.travel_m, limits.velocity_m_per_s, limits.acceleration_m_per_s2
         position_m, velocity = rows["position_m"], rows["velocity_m_per_s"]
+        acceleration = rows["acceleration_m_per_s2"]
         left_m = np.where(velocity > 0.0, high_m - position_m, position_m - low_m)
         stopping_m = velocity**2 / (2.0 * room.stop_deceleration_m_per_s2)
         travel = f"the travel [{low_m:g}, {high_m:g}] m"
-        for field, values, good, limit, remedy in (
+        checks = (
             ("position_m", position_m, (low_m <= position_m) & (position_m <= high_m), travel, "stay within it"),
             ("velocity_m_per_s", velocity, np.abs(velocity) <= top, f"{top:g} m/s", "send them closer together"),
-            (
-                "acceleration_m_per_s2",
-                rows["acceleration_m_per_s2"],
-                np.abs(rows["acceleration_m_per_s2"]) <= hardest,
-                f"{hardest:g} m/s^2",
-                "send a smoother motion",
-            ),
+            ("acceleration_m_per_s2", acceleration, np.abs(acceleration) <= hardest, f"{hardest:g} m/s^2", _SMOOTHER),
             ("stopping distance_m", stopping_m, stopping_m <= left_m, travel, "go slower near its end"),
-        ):
-            if not np.all(good):
-                row = int(np.argmin(good))
-                raise RequestError(
-                    f"set-point {first_number + row // self._cycles}: on the way there {field} is {values[row]:.6g}, "
-                    f"beyond {limit}: {remedy}"
-                )
+        )
+        failed = [(int(np.argmin(one[2])), one) for one in checks if not np.all(one[2])]
+        if failed:
+            row, (field, values, _, limit, remedy) = min(failed, key=lambda found: found[0])
+            raise RequestError(
+                f"set-point {first_number + row // self._cycles}: on the way there {field} is {values[row]:.6g}, "
+                f"beyond {limit}: {remedy}"
+            )
         tail = self._brake(end)
         ends_m = tail["position_m"]
         if not (low_m <= ends_m.min() and ends_m.max() <= high_m):

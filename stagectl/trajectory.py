@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import ruckig
@@ -556,12 +556,16 @@ def _envelope(t_s: np.ndarray, ramp_s: float, duration_s: float) -> tuple[np.nda
     )
 
 
-def _evaluate(knots_s: np.ndarray, states: np.ndarray, t_s: np.ndarray) -> tuple[np.ndarray, ...]:
+def _evaluate(
+    knots_s: np.ndarray, states: np.ndarray, t_s: np.ndarray, side: Literal["left", "right"] = "right"
+) -> tuple[np.ndarray, ...]:
     """Position to jerk of a piecewise polynomial at `t_s`; before the first and after the last knot it stands.
+
+    At a knot the jerk is that of the piece on this `side`.
 
     `states[i]` holds the derivatives 0 .. 5 just after knot i, shape (knots, 6); the last row is the state of rest.
     """
-    segment = np.clip(np.searchsorted(knots_s, t_s, side="right") - 1, 0, knots_s.size - 1)
+    segment = np.clip(np.searchsorted(knots_s, t_s, side=side) - 1, 0, knots_s.size - 1)
     h = np.maximum(t_s - knots_s[segment], 0.0)
     d = states[segment].T
     before = t_s < knots_s[0]
@@ -644,10 +648,10 @@ def _spline(t_s: np.ndarray, position_m: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def through_states(t_s: np.ndarray, p_m: np.ndarray, v_m_per_s: np.ndarray, a_m_per_s2: np.ndarray, at_s: np.ndarray):
-    """Return SETPOINT rows at `at_s` of the quintics that go through states at `t_s`, all shape (n,)."""
+    """Return SETPOINT rows at `at_s` of the quintics through states at `t_s`, shapes (n,); jerk of what ends there."""
     setpoints = _table(at_s.size)
     states = _quintics(t_s, p_m, v_m_per_s, a_m_per_s2)
-    for column, values in zip(_COLUMNS, _evaluate(t_s, states, at_s), strict=True):
+    for column, values in zip(_COLUMNS, _evaluate(t_s, states, at_s, "left"), strict=True):
         setpoints[column] = values
     return setpoints
 
