@@ -144,9 +144,11 @@ def init(
     filter_s: float = 0.015,
     doubts: Doubts | None = None,
     force_noise_n: float = 5e-3,
-    edge_drift_m_per_sqrt_s: float = 0.0,
+    edge_drift_m_per_sqrt_s: float | None = None,
 ) -> np.ndarray:
     """Make BACKLASH: nothing known of edges and stiffness, whatever the profile believes.
+
+    Without a drift of the edges the profile's wear table says how they may wander.
 
     In closed loop the sensors' noise moves the stage, and what moves it is then no longer independent of the residual:
     at 100 nm a filter of 10 ms found a mass 2 % low, one of 15 ms finds it within its interval.
@@ -161,7 +163,8 @@ def init(
     b["least_force_n"] = 0.3
     b["force_share_ratio"] = 0.1
     b["margin_m"] = 10e-6
-    b["edge_drift_m_per_sqrt_s"] = edge_drift_m_per_sqrt_s
+    drift = profile.wear.edge_drift_m_per_sqrt_s if edge_drift_m_per_sqrt_s is None else edge_drift_m_per_sqrt_s
+    b["edge_drift_m_per_sqrt_s"] = drift
     b["position_noise_m"] = profile.interferometer.noise_m
     b["force_noise_n"] = force_noise_n
     # Chain of three: X = expm(A h), input integrals by a Taylor series of the augmented matrix (first-order hold)

@@ -170,6 +170,10 @@ class Client:
         """Identify the backlash."""
         return self.do("identify", messages.Identify(frequency_hz=frequency_hz, duration_s=duration_s))
 
+    def probe(self) -> messages.Command:
+        """Touch both edges of the joint, where the profile permits it."""
+        return self.do("probe", messages.Probe())
+
     def acknowledge(self, number: int) -> messages.Command:
         """Take note of a fault; enables nothing."""
         return self.do("acknowledge", messages.Acknowledge(number=number))

@@ -148,6 +148,35 @@ class Homing(StreamMotion):
         self._belief["right_stiffness_n_per_m"] = estimate.right_stiffness_n_per_m
         self._publish_update(macro_zero, end_zero)
 
+    def replace_backlash(self, estimate: BacklashEstimate) -> None:
+        """Believe what wear has made of the joint; zeros stay, the stage does not move, the estimator begins anew.
+
+        A recorded event. RequestError while a motion is under way.
+        """
+        status = self.status()
+        if status["phase"] != Phase.TRACKING or status["segment_left_rows"] > 0:
+            raise RequestError("a backlash is replaced between moves only; wait until the stage holds")
+        before = {name: float(self._belief[name][0]) for name in _JOINT}
+        for name in _JOINT:
+            self._belief[name] = getattr(estimate, name)
+        self._event("backlash_replaced", before=before, after={name: float(self._belief[name][0]) for name in _JOINT})
+        macro_scale, end_scale = self._scales()
+        macro_zero = float(status["macro_counts"]) - float(status["macro_position_m"]) / macro_scale
+        end_zero = float(status["end_counts"]) - float(status["end_position_m"]) / end_scale
+        self._publish_update(macro_zero, end_zero)
+
+    def believed_backlash(self) -> dict[str, float]:
+        """Return what the compensation believes of the joint: edges and stiffness."""
+        return {name: float(self._belief[name][0]) for name in _JOINT}
+
+    def probe(self) -> Outcome:
+        """Touch both edges with `TOUCH_SHARE` of the touch force (5 N at most), only where the profile permits it."""
+        if self.profile.wear.probe_every_s is None:
+            raise RequestError(
+                f"profile {self.profile.name} permits no touch probe; give wear.probe_every_s, or identify instead"
+            )
+        return self.sweep(TOUCH_SHARE, TOUCH_HZ, TOUCH_S, "touching both edges")
+
     def sweep(
         self, force_share: float, usual_hz: float, duration_s: float, name: str, asked_hz: float | None = None
     ) -> Outcome:

@@ -113,7 +113,7 @@ class Motion(Session):
             self._progress(name, 1.0 - left_rows / rows_count)
         detail = "" if stop is Stop.FINISHED else self.detail
         self._event("segment_end", number=newest, stop=stop.name, **({"detail": detail} if detail else {}))
-        return self._outcome(name, stop, first_row, self._backlash(status))
+        return self._outcome(name, stop, first_row, self.backlash(status))
 
     def _begin_segment(self, setpoints: np.ndarray, name: str, law: str | None = None, at_row: int = 0) -> int:
         """Have the servo follow a segment, behind `at_row` rows of the one under way; returns its number."""
@@ -136,7 +136,8 @@ class Motion(Session):
         self._request(**fields)
         return number
 
-    def _backlash(self, status: np.void) -> BacklashEstimate | None:
+    def backlash(self, status: np.void) -> BacklashEstimate | None:
+        """Return what a state of the servo says of the joint; None on a stage without a micro."""
         if self.profile.micro is None:
             return None
         return BacklashEstimate(

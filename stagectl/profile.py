@@ -14,7 +14,7 @@ from stagectl.effect_file import EffectFile
 from stagectl.effect_table import EffectTable, without_micro
 from stagectl.errors import ProfileError
 from stagectl.interferometer_profile import Interferometer, carries_end
-from stagectl.toml_file import Document, Problem, Table, above, missing, problem_if, refuse, whole, within
+from stagectl.toml_file import Document, Flag, Problem, Table, above, missing, problem_if, refuse, whole, within
 
 PROFILES_FOLDER = Path(__file__).resolve().parent.parent / "profiles"
 SYSTEM_FOLDER = Path("/etc/stagectl")
@@ -257,6 +257,17 @@ class Backlash(Table):
         return self
 
 
+class Wear(Table):
+    """How the joint's wear is followed while the stage works, and what of it may be believed by itself."""
+
+    width_change_limit_m: Annotated[float, above(0.0, 1.0)] = 50e-6
+    stiffness_change_limit_ratio: Annotated[float, within(0.01, 10.0)] = 0.3
+    trusted_sd_m: Annotated[float, above(0.0, 1.0)] = 0.5e-6
+    edge_drift_m_per_sqrt_s: Annotated[float, within(0.0, 1e-3)] = 0.0  # that the estimator allows for
+    probe_every_s: Annotated[float, within(10.0, 1e8)] | None = None  # without it nothing is touched unasked
+    compensate: Flag = False
+
+
 class Air(Table):
     """Laser and air: what the index of air is computed from."""
 
@@ -331,6 +342,7 @@ class Profile(Document):
     air: Air
     control: Control
     record: Record = Record()
+    wear: Wear = Wear()
     effect_files: tuple[EffectFile, ...] = ()  # before the effects that they declare
     effects: tuple[EffectTable, ...] = ()
 

@@ -33,19 +33,24 @@ class Program(NamedTuple):
 
 
 def plan(
-    start_m: float, waypoints: Sequence[Waypoint], repeat_count: int, limits: Limits, dt_s: float = 1e-3
+    start_m: float,
+    waypoints: Sequence[Waypoint],
+    repeat_count: int,
+    limits: Limits,
+    dt_s: float = 1e-3,
+    longest_s: float = math.inf,
 ) -> Program:
     """Plan a scan from rest at `start_m`, jerk-limited, every part in its own velocity.
 
-    RequestError names the segment, the value, its limit and what to do.
+    One repetition takes `longest_s` at most. RequestError names the segment, the value, its limit and what to do.
     """
     if not waypoints:
         raise RequestError("segments: there is none; give one or more")
     if repeat_count < 1:
         raise RequestError(f"repeat_count is {repeat_count}; give 1 or more")
     _check(waypoints, limits)
-    first = trajectories.chain(start_m, waypoints, limits, dt_s, "scan")
-    again = trajectories.chain(waypoints[-1].target_m, waypoints, limits, dt_s, "scan")
+    first = trajectories.chain(start_m, waypoints, limits, dt_s, "scan", longest_s)
+    again = trajectories.chain(waypoints[-1].target_m, waypoints, limits, dt_s, "scan", longest_s)
     again_rows = again.setpoints[1:]  # its first row is the last one before
     # A repetition that is over before the next is asked for would leave a pause: short ones go together.
     together = max(1, math.ceil(_PART_S / (again_rows.size * dt_s)))

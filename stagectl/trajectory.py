@@ -227,7 +227,12 @@ def brake(start: MotionState, limits: Limits, dt_s: float = 1e-3) -> Trajectory:
 
 
 def chain(
-    start_m: float, waypoints: Sequence[Waypoint], limits: Limits, dt_s: float = 1e-3, name: str = "chain"
+    start_m: float,
+    waypoints: Sequence[Waypoint],
+    limits: Limits,
+    dt_s: float = 1e-3,
+    name: str = "chain",
+    longest_s: float = math.inf,
 ) -> Trajectory:
     """From rest at `start_m` from waypoint to waypoint, each part the fastest within its velocity and `limits`.
 
@@ -252,6 +257,11 @@ def chain(
             knots.append(np.array([end_s]))
             parts.append(np.array([[point.target_m, 0.0, 0.0, 0.0, 0.0, 0.0]]))
         begin_s = end_s + point.dwell_s
+    if begin_s > longest_s:
+        raise RequestError(
+            f"segments: one repetition takes {begin_s:g} s, {longest_s:g} s is the limit; give fewer segments or "
+            "shorter dwells"
+        )
     end_m = state.position_m
     knots.append(np.array([begin_s]))
     parts.append(np.array([[end_m, 0.0, 0.0, 0.0, 0.0, 0.0]]))
@@ -347,7 +357,9 @@ def from_file(path: str | Path, dt_s: float = 1e-3) -> Trajectory:
     return from_text(text, dt_s, file.stem, str(file))
 
 
-def from_text(text: str, dt_s: float = 1e-3, name: str = "table", place: str = "") -> Trajectory:
+def from_text(
+    text: str, dt_s: float = 1e-3, name: str = "table", place: str = "", longest_s: float = math.inf
+) -> Trajectory:
     """Read CSV with the header `t_s,position_m` and smooth it as `from_table` does; `place` is where it is from."""
     place = place or f"'{name}'"
     header = ["t_s", "position_m"]
@@ -369,6 +381,11 @@ def from_text(text: str, dt_s: float = 1e-3, name: str = "table", place: str = "
             raise RequestError(
                 f"trajectory {place}, row {i + 1}: {','.join(row)[:60]!r}; two numbers are needed"
             ) from error
+    if values.size and not values[-1, 0] - values[0, 0] <= longest_s:
+        raise RequestError(
+            f"trajectory {place} takes {values[-1, 0] - values[0, 0]:g} s, {longest_s:g} s is the limit; cut it in "
+            "parts. Are the times milliseconds? Divide by 1000"
+        )
     return from_table(values[:, 0], values[:, 1], dt_s, name)
 
 

@@ -201,6 +201,7 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
     taker("move", messages.Move, "Move the end to a position.")
     taker("jog", messages.JogBy, "Move the end by a distance.")
     taker("identify", messages.Identify, "Identify the backlash by a sweep over both edges.")
+    taker("probe", messages.Probe, "Touch both edges of the joint with 5 N at most, where the profile permits it.")
     taker("acknowledge", messages.Acknowledge, "Take note of a fault; enables nothing.")
     taker("backend", messages.SwapBackend, "Work in another world; without power only.")
     taker("reread", messages.Home, "Read the profile again; without power only.")

@@ -335,6 +335,12 @@ class Desk:
             self._keep_order(order)
             return order.message()
 
+    def submit_own(self, name: str, body: Any) -> None:
+        """Submit a command of the service's own, under the lease that somebody holds; not where one is under way."""
+        with self._lock, contextlib.suppress(RequestError):
+            if self._lease is not None:
+                self.submit(name, body, f"own-{secrets.token_hex(8)}", self._lease.token)
+
     def jog_at(self, body: messages.JogAt, token: str) -> messages.Command:
         """Begin to jog, or go on at this velocity. Errors: RequestError and kinds."""
         with self._lock:
@@ -383,5 +389,7 @@ class Desk:
         top = jog_velocity_m_per_s(profile)
         if name == "jog_at" and not abs(body.velocity_m_per_s) <= top:
             raise Unfit(f"velocity_m_per_s is {body.velocity_m_per_s:g}: a jog may do {top:g} m/s; ask for less")
-        if name == "identify" and profile.micro is None:
+        if name == "probe" and profile.wear.probe_every_s is None:
+            raise Unfit(f"profile {profile.name} permits no touch probe; give wear.probe_every_s, or identify instead")
+        if name in ("identify", "probe") and profile.micro is None:
             raise Unfit(f"profile {profile.name}: this stage has no micro; there is no backlash to identify")

@@ -109,8 +109,7 @@ class Figures:
         for name, value in status.positions.model_dump().items():
             if value is not None:
                 yield GaugeMetricFamily(f"stagectl_{name.removesuffix('_m')}_meters", name, value=value)
-        if status.backlash is not None:
-            yield from _wear(status)
+        yield from _wear(status)
 
     def exposition(self, status: Status) -> bytes:
         """Return the text format of Prometheus."""
@@ -120,7 +119,7 @@ class Figures:
 
 
 def _wear(status: Status) -> Iterator[Metric]:
-    joint = status.backlash
+    joint = status.wear or status.backlash
     if joint is None:
         return
     yield GaugeMetricFamily("stagectl_backlash_width_meters", "Width of the joint's gap", value=joint.width_m)
@@ -131,6 +130,13 @@ def _wear(status: Status) -> Iterator[Metric]:
         value = getattr(joint, f"{side}_stiffness_n_per_m")
         text = f"Stiffness of the {side} contact"
         yield GaugeMetricFamily(f"stagectl_backlash_{side}_stiffness_newtons_per_meter", text, value=value)
+    if status.wear is not None:
+        text = "Since the joint's values were found"
+        yield GaugeMetricFamily("stagectl_backlash_age_seconds", text, value=status.wear.age_s)
+        text = "1 where both edges were touched lately"
+        yield GaugeMetricFamily("stagectl_backlash_observable", text, value=float(status.wear.observable))
+        text = "1 where a limit of wear is passed"
+        yield GaugeMetricFamily("stagectl_backlash_wear_alarm", text, value=float(bool(status.wear.alarm)))
 
 
 class _Once:

@@ -123,6 +123,10 @@ class StreamState(BaseModel):
     room_count: int
 
 
+class Probe(_Asked):
+    """Touch both edges with a few newtons; only where the profile permits it."""
+
+
 class SwapBackend(_Asked):
     """Work in another world; only without power."""
 
@@ -162,6 +166,31 @@ class Backlash(BaseModel):
     """When, UTC."""
     run: str
     profile_name: str
+
+
+class Wear(BaseModel):
+    """The joint as production motion, a probe or an identification showed it last, and how sure that is now."""
+
+    left_m: float
+    right_m: float
+    left_stiffness_n_per_m: float
+    right_stiffness_n_per_m: float
+    left_stiffness_sd_n_per_m: float | None
+    right_stiffness_sd_n_per_m: float | None
+    width_m: float
+    width_sd_m: float | None
+    """Grows with the age."""
+    at: str
+    age_s: float
+    source: str
+    """production | touch probe | identified"""
+    observable: bool
+    """Whether both edges were touched lately; where not, the last value stands here."""
+    text: str
+    alarm: str
+    """Which limit of wear is passed; empty where none."""
+    believed_since: str
+    """When the compensation took a value over by itself, UTC; empty where it did not."""
 
 
 class Fault(BaseModel):
@@ -269,6 +298,7 @@ class Status(BaseModel):
     positions: Positions
     health: Health
     backlash: Backlash | None
+    wear: Wear | None
     fault: Fault | None
     lease: LeaseState | None
     command: Command | None

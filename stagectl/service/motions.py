@@ -33,6 +33,7 @@ MOTIONS: dict[str, Motion] = {
     "scan": Motion(Event.MOVE, lambda stage, order: stage.scan(order.plan, order.body.law)),
     "follow": Motion(Event.MOVE, lambda stage, order: stage.run(order.plan, order.body.law)),
     "setpoints": Motion(Event.MOVE, lambda stage, order: stage.follow_stream(order.plan)),
+    "probe": Motion(Event.IDENTIFY, lambda stage, order: stage.probe(), identifies=True),
     "identify": Motion(
         Event.IDENTIFY,
         lambda stage, order: stage.identify(order.body.frequency_hz, order.body.duration_s),

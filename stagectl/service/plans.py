@@ -15,6 +15,8 @@ from stagectl.service import messages
 from stagectl.streaming import Room, SetpointBuffer
 from stagectl.trajectory import Waypoint
 
+_FILLED_S = 2.0  # short repetitions go together
+
 
 class Plan(NamedTuple):
     """What the stage follows, and what a person should look at."""
@@ -44,13 +46,8 @@ def scanned(body: messages.Scan, profile: Profile, holds_m: float) -> Plan:
         for part in body.segments
     ]
     start_m = holds_m if body.start_m is None else body.start_m
-    program = scan.plan(start_m, waypoints, body.repeat_count, limits, profile.cycle.period_s)
-    longest = max(program.first.setpoints.size, program.again.setpoints.size)
-    if longest > SEGMENT_ROWS // 3:
-        raise RequestError(
-            f"segments: one repetition takes {longest * profile.cycle.period_s:g} s, "
-            f"{SEGMENT_ROWS // 3 * profile.cycle.period_s:g} s is the limit; give fewer segments or shorter dwells"
-        )
+    longest_s = (SEGMENT_ROWS // 3 - 1) * profile.cycle.period_s - _FILLED_S
+    program = scan.plan(start_m, waypoints, body.repeat_count, limits, profile.cycle.period_s, longest_s)
     check(program.first, profile)
     check(program.again, profile)
     return Plan(program)
@@ -58,13 +55,8 @@ def scanned(body: messages.Scan, profile: Profile, holds_m: float) -> Plan:
 
 def followed(body: messages.Follow, profile: Profile) -> Plan:
     """Plan the motion of a table. Errors: RequestError, with the units that it seems to have."""
-    planned = trajectories.from_text(body.text, profile.cycle.period_s, body.name)
-    if planned.setpoints.size > SEGMENT_ROWS:
-        raise RequestError(
-            f"trajectory '{body.name}' takes {planned.duration_s:g} s, "
-            f"{SEGMENT_ROWS * profile.cycle.period_s:g} s is the limit; cut it in parts. "
-            + suspected_units.of_times(planned, profile.macro.velocity_limit_m_per_s)
-        )
+    dt_s = profile.cycle.period_s
+    planned = trajectories.from_text(body.text, dt_s, body.name, longest_s=(SEGMENT_ROWS - 1) * dt_s)
     try:
         check(planned, profile)
     except RequestError as error:

@@ -20,6 +20,7 @@ from stagectl.service.states import Event, State
 from stagectl.service.view import BANNERS, backlash_message
 from stagectl.signals import Stop
 from stagectl.stage import choose
+from stagectl.wear import IDENTIFIED, PROBE
 
 
 class StageLoop(StageWatch):
@@ -49,6 +50,7 @@ class StageLoop(StageWatch):
             self._carry_out(order)
         elif self._stage is not None:
             self._watch()
+            self._care_for_joint()
         elif self._state is State.OFF and time.monotonic() >= self._retry_at_s:
             self._open()
         else:
@@ -132,8 +134,29 @@ class StageLoop(StageWatch):
             self._homed = outcome.finished
         self._settle(order.name)
         backlash = self._kept_backlash(outcome, folder.name) if motion.identifies else None
+        if backlash is not None and self._wear is not None:
+            self._wear.found(outcome.backlash, PROBE if order.name == "probe" else IDENTIFIED)
         order.finish(outcome.text, outcome.stop.name, str(folder), backlash)
         self._log.say("command_done", outcome.text, name=order.name, key=order.key, stop=outcome.stop.name)
+
+    def _care_for_joint(self) -> None:
+        """Between moves: believe what wear has made of the joint, or have it touched, where the profile permits it."""
+        stage, wear = self._stage, self._wear
+        if stage is None or wear is None or self._state is not State.ARMED or not self._homed:
+            return
+        status = stage.status()
+        if status["phase"] != Phase.TRACKING or status["segment_left_rows"] > 0:
+            return
+        found = wear.replacement(stage.believed_backlash())
+        if found is not None:
+            try:
+                stage.replace_backlash(found)
+            except StagectlError as error:
+                self._break(error)
+                return
+            wear.replaced(found)
+        elif wear.probe_due():
+            self.desk.submit_own("probe", messages.Probe())
 
     def _kept_backlash(self, outcome: Outcome, run: str) -> messages.Backlash | None:
         estimate, stage = outcome.backlash, self._stage

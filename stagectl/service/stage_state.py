@@ -20,7 +20,8 @@ from stagectl.service.remembered import Memory, Remembered
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import Event, State
-from stagectl.service.view import BANNERS, health, limits, positions
+from stagectl.service.view import BANNERS, backlash_message, health, limits, positions
+from stagectl.service.wear_watch import WearWatch
 from stagectl.signals import STOP_TEXT, Stop
 from stagectl.supervisor import Supervisor
 
@@ -67,6 +68,7 @@ class StageState:
         self._retry_at_s = 0.0
         self._leaving = self._rereading = self._opening = self._breaking = False
         self._scope = Scope(1000.0)
+        self._wear: WearWatch | None = None
         self._homed = False
         self._order: Order | None = None
         self._late: tuple[float, float] | None = None
@@ -81,9 +83,26 @@ class StageState:
     def _tick(self) -> None:
         """Publish where things stand, and feed the watchdog as long as the servo's cycles, or else this loop, go on."""
         self._heed_record_requests()
+        self._look_at_joint()
         status = self._view()
         self.desk.publish(status, self._state)
         self._notifier.feed(status.health.cycles_count if self._stage is not None else time.monotonic_ns())
+
+    def _look_at_joint(self) -> None:
+        """Follow the wear of a joint that works."""
+        stage, wear = self._stage, self._wear
+        if stage is None or wear is None or self._opening:
+            return
+        status = stage.status()
+        if status["phase"] == Phase.TRACKING:
+            wear.look(stage.backlash(status))
+
+    def _keep_wear(self) -> None:
+        """Have what production motion showed survive a restart."""
+        found = None if self._wear is None or self._stage is None else self._wear.newest_of_production()
+        if found is not None and self._stage is not None:
+            run = self._recording.folder(self._stage.folder).name
+            self._memory.keep(backlash=backlash_message(found, run, self._stage.profile.name, now_text()))
 
     def _heed_record_requests(self) -> None:
         """Begin or end a run that a client asked for; motions go on meanwhile."""
@@ -105,6 +124,8 @@ class StageState:
             self._log.say("state", text, state=self._state.value, before=before.value, because=event.value)
             self._notifier.say(STATUS=f"{self._state.value}, {self._backend or 'no world'}")
         self.desk.powered = self._state in states.POWERED
+        if before in states.POWERED and not self.desk.powered:
+            self._keep_wear()
         if before in states.POWERED and not self.desk.powered and not self._breaking:
             self._recording.end(recording.ARM, *self._why(event, before))
 
@@ -159,6 +180,7 @@ class StageState:
             positions=positions(status),
             health=health(status, profile.cycle.rate_hz if profile is not None else 0.0, self._late),
             backlash=self._memory.now.backlash,
+            wear=None if self._wear is None else self._wear.message(),
             fault=self._fault,
             lease=self.desk.lease_state(),
             command=order.message() if order is not None else None,

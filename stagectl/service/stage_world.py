@@ -13,6 +13,7 @@ from stagectl.service.scope import Scope
 from stagectl.service.stage_state import StageState
 from stagectl.service.states import Event, State
 from stagectl.service.view import BANNERS
+from stagectl.service.wear_watch import WearWatch
 from stagectl.service.world import missing
 from stagectl.stage import choose, open_stage
 
@@ -72,6 +73,8 @@ class StageWorld(StageState):
             self.desk.scope = self._scope
             stage.__enter__()
             self._stage, self._homed, self._waiting_for = stage, False, ""
+            self._wear = WearWatch(stage.profile, self._log, time.monotonic)
+            self._wear.recall(self._memory.now.backlash)
             self._cycles_seen = -1
         except Leaving:
             return
@@ -140,6 +143,8 @@ class StageWorld(StageState):
     def _observe(self, rows: np.ndarray) -> None:
         self._scope.add(rows)
         self._figures.add(rows)
+        if self._wear is not None:
+            self._wear.observe(rows)
 
     def _progress(self, what: str, share: float) -> None:
         """Hear from the supervisor that a motion goes on; the place where a stop comes in."""
