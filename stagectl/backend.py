@@ -66,6 +66,8 @@ class Backend(Protocol):
 
     name: str
     description: str
+    may_move: bool
+    """False where real drives stand on a simulated interferometer: to be watched only."""
 
     @property
     def vendor_id(self) -> int | None:
@@ -198,6 +200,7 @@ class BatchBackend:
     """Rig, wire and servo in one process and in virtual time: deterministic for a seed."""
 
     name = "batch"
+    may_move = True
     vendor_id = RIG_VENDOR_ID
     synchronous = True
 
@@ -356,6 +359,7 @@ class RealtimeBackend:
     """Servo in a process of its own, on a real clock; what bus and port lead to is the caller's business."""
 
     synchronous = False
+    may_move = True
 
     def __init__(self, profile: Profile, name: str, vendor_id: int | None, interface: str, channel: str, port: str):
         """Start warming a servo process; it opens nothing before `start_servo`."""
@@ -487,17 +491,31 @@ def ask_rig(channel: str, message: dict) -> dict:
     return json.loads(answer.removeprefix(b"RIG "))
 
 
+RIG, RIG_DRIVES, RIG_SENSOR = "rig", "rig-drives", "rig-sensor"
+"""Which part the rig plays: all of the stage; its drives, on a real interferometer; its interferometer alone."""
+
+
 class RigBackend(RealtimeBackend):
     """The software rig in a process of its own: the same bytes, in real time."""
 
-    def __init__(self, profile: Profile, machine: str | Path, *, seed: int = 0, linger_s: float = 5.0):
-        """Start the rig; servo and rig compile side by side. It outlives a killed owner by `linger_s`."""
+    def __init__(
+        self, profile: Profile, machine: str | Path, *, seed: int = 0, linger_s: float = 5.0, plays: str = RIG
+    ):
+        """Start the rig; servo and rig compile side by side. It outlives a killed owner by `linger_s`.
+
+        What it doesn't play is the profile's hardware; real drives on its interferometer may never move.
+        """
         self._folder = Path(tempfile.mkdtemp(prefix="stagectl-rig-"))
-        channel, port = str(self._folder / "can.socket"), str(self._folder / "interferometer")
-        super().__init__(profile, "rig", RIG_VENDOR_ID, "hub", channel, port)
+        self._rig_channel, port = str(self._folder / "can.socket"), str(self._folder / "interferometer")
+        self.may_move = plays != RIG_SENSOR
+        drives = (RIG_VENDOR_ID, "hub", self._rig_channel)
+        if plays == RIG_SENSOR:
+            drives = (None, profile.can.interface, profile.can.channel)
+        sensor = profile.interferometer.port if plays == RIG_DRIVES else port
+        super().__init__(profile, plays, *drives, sensor)
         self.seed = seed
         self._truth_path = self._folder / "truth.npz"
-        command = [sys.executable, "-m", "sim_backend", str(machine), "--socket", channel, "--pty-link", port]
+        command = [sys.executable, "-m", "sim_backend", str(machine), "--socket", self._rig_channel, "--pty-link", port]
         command += ["--seed", str(seed), "--truth", str(self._truth_path), "--linger-s", str(linger_s)]
         self._rig = _Child("rig", command)
         try:
@@ -505,12 +523,17 @@ class RigBackend(RealtimeBackend):
         except BaseException:
             self.close()
             raise
-        self.description = f"software rig {Path(machine).stem}, real time, seed {seed}"
+        with_what = {
+            RIG: "",
+            RIG_DRIVES: f" for the drives, real interferometer {sensor}",
+            RIG_SENSOR: f" for the interferometer, real drives on {self._interface} {self._channel}, watched only",
+        }
+        self.description = f"software rig {Path(machine).stem}{with_what[plays]}, real time, seed {seed}"
 
     @property
     def channel(self) -> str:
         """Path of the hub's socket."""
-        return self._channel
+        return self._rig_channel
 
     @property
     def rig_pid(self) -> int:
@@ -519,10 +542,15 @@ class RigBackend(RealtimeBackend):
 
     def request(self, message: dict) -> dict:
         """Ask the rig process something: {"fault": ...}, {"truth": path}, {"state": true}."""
-        return ask_rig(self._channel, message)
+        return ask_rig(self._rig_channel, message)
 
     def truth(self) -> dict[str, np.ndarray] | None:
-        """Return the rig's log so far; None where the rig is dead. LinkError where it lives and does not answer."""
+        """Return the rig's log so far; None where the rig is dead. LinkError where it lives and does not answer.
+
+        Nobody knows what is true of a stage of which a part is real.
+        """
+        if self.name != RIG:
+            return None
         try:
             self.request({"truth": str(self._truth_path)})
         except LinkError:

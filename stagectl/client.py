@@ -253,6 +253,14 @@ class Client:
         """End the run that was asked for; needs no lease."""
         return messages.Status.model_validate(self._ask("DELETE", "/v1/record"))
 
+    def set_trigger(self, trigger: messages.SetTrigger) -> messages.Status:
+        """Record what is around an event; needs no lease."""
+        return messages.Status.model_validate(self._ask("PUT", "/v1/record/trigger", trigger))
+
+    def end_trigger(self) -> messages.Status:
+        """Wait for no event any more; needs no lease."""
+        return messages.Status.model_validate(self._ask("DELETE", "/v1/record/trigger"))
+
     def begin(self, name: str, body: BaseModel, key: str = "") -> messages.Command:
         """Send a command and don't wait; the same key again is the same command."""
         headers = {"Idempotency-Key": key or f"client-{secrets.token_hex(12)}"}

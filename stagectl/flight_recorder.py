@@ -169,15 +169,20 @@ class FlightRecorder:
 
     def save_last(self, name: str, trigger: str) -> Path | None:
         """Write the last seconds as a run of their own, beside one under way; None where there are no rows."""
-        if not self._rows:
+        return self.save_window(name, trigger, self.rows_count - self._kept_count, self.rows_count)
+
+    def save_window(self, name: str, trigger: str, first_row: int, end_row: int) -> Path | None:
+        """Write the rows of the session from `first_row` to before `end_row` as a run, as far as they are kept."""
+        kept_from = self.rows_count - self._rows_held_count
+        first_row, end_row = max(first_row, kept_from), min(end_row, self.rows_count)
+        if end_row <= first_row:
             return None
         with self._policy():
-            rows = np.concatenate(list(self._rows))[-self._kept_count :]
+            rows = np.concatenate(list(self._rows))[first_row - kept_from : end_row - kept_from]
             folder = self._reserve(name)
             saved = Recorder(folder, {**self._manifest, "trigger": trigger, "start_t_ns": int(rows["t_ns"][0])})
-            first_row = self.rows_count - rows.size
             for event, t_ns, row, fields in self._events:
-                if row >= first_row:
+                if first_row <= row < end_row or row == end_row == self.rows_count:
                     saved.event(event, t_ns, row - first_row, **fields)
             saved.append(rows)
             saved.close({"trigger": trigger})

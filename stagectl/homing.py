@@ -7,6 +7,7 @@ from stagectl import trajectory as trajectories
 from stagectl.errors import DriveError, RequestError
 from stagectl.outcome import BacklashEstimate, Outcome
 from stagectl.requests import Mode, Phase
+from stagectl.session import WATCHED_ONLY
 from stagectl.signals import Stop
 from stagectl.stream_motion import StreamMotion
 from stagectl.touch_sweep import (
@@ -97,6 +98,8 @@ class Homing(StreamMotion):
 
     def _home_drive(self) -> Stop:
         """Let the macro's drive find its index."""
+        if not self.backend.may_move:  # before anything is written to a drive
+            raise RequestError(WATCHED_ONLY)
         homing, node = self.profile.macro.homing, self.profile.macro.node_id
         step_m = self.profile.macro.encoder_step_m
         self.disarm()

@@ -415,11 +415,14 @@ class Profile(Document):
     @property
     def worst_bus_load_ratio(self) -> float:
         """Return the share of the bus that cyclic frames take when every stuff bit is needed."""
-        bits = _frame_bits(0)
-        for axis in self.axes:
-            by_position = axis == "macro" and self.macro.mode == "position"
-            bits += _frame_bits(8 if by_position else 4) + _frame_bits(8)
+        bits = self.command_frames_bits + len(self.axes) * frame_bits(8)
         return bits * self.cycle.rate_hz / self.can.bitrate_bit_per_s
+
+    @property
+    def command_frames_bits(self) -> int:
+        """Return the longest that SYNC and the RPDOs of one cycle can be."""
+        by_position = self.macro.mode == "position"
+        return frame_bits(0) + sum(frame_bits(8 if axis == "macro" and by_position else 4) for axis in self.axes)
 
     @model_validator(mode="after")
     def _check_relations(self, info: ValidationInfo) -> "Profile":
@@ -602,7 +605,7 @@ def _eds_path(name: str, profile_path: Path | None) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _frame_bits(data_bytes: int) -> int:
+def frame_bits(data_bytes: int) -> int:
     """Return the longest a classic CAN frame can be: all stuff bits and the space after it (ISO 11898-1)."""
     stuffed = 34 + 8 * data_bytes
     return stuffed + (stuffed - 1) // 4 + 13

@@ -34,6 +34,13 @@ _SENSOR_TIMEOUT_S = 5.0
 _RESET_TIMEOUT_S = 2.0
 _FAULTS = (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE)
 
+_WITH_POWER = (int(Mode.TRACK), int(Mode.HOME_DRIVE))
+WATCHED_ONLY = (
+    "real drives on a simulated interferometer may only be watched: what moves is not what is measured; connect the "
+    "interferometer and take the backend hardware, or rig"
+)
+"""Why nothing is armed in such a world."""
+
 Progress = Callable[[str, float], None]
 
 
@@ -278,6 +285,8 @@ class Session:
         return f"interferometer {sensor.port}: no steady valid samples within {_SENSOR_TIMEOUT_S:g} s: {found}"
 
     def _request(self, **fields: Any) -> None:
+        if not self.backend.may_move and fields.get("mode") in _WITH_POWER:
+            raise RequestError(WATCHED_ONLY)
         self._counter += 1
         self.link.requests.publish({"counter": self._counter, **fields})
 
@@ -307,6 +316,8 @@ class Session:
         """Enable both drives and hold where the stage is; returns why not, NONE when it holds."""
         if self.status()["phase"] == Phase.TRACKING:
             return Stop.NONE
+        if not self.backend.may_move:
+            raise RequestError(WATCHED_ONLY)
         if self._asked_to_stop:
             return Stop.OPERATOR
         if self._heartbeats.missing:

@@ -6,18 +6,28 @@ from pathlib import Path
 from typing import Any
 
 from sim_backend.machine import load_machine, machine_path_for
-from stagectl.backend import BatchBackend, HardwareBackend, RigBackend
+from stagectl.backend import RIG, RIG_DRIVES, RIG_SENSOR, BatchBackend, HardwareBackend, RigBackend
 from stagectl.errors import LinkError, RequestError
 from stagectl.profile import Profile
 from stagectl.run_folder import reserve
 from stagectl.session import Progress
 from stagectl.supervisor import Supervisor
 
-BACKENDS = ("auto", "hardware", "rig", "batch")
+BACKENDS = ("auto", "hardware", RIG, RIG_DRIVES, RIG_SENSOR, "batch")
 
 
-def present(profile: Profile) -> dict[str, bool]:
-    """Say which parts of the profile's hardware this host has."""
+def present(profile: Profile, backend: str = "hardware") -> dict[str, bool]:
+    """Say which parts of the profile's hardware this host has, of those that a world needs."""
+    found = {"CAN": _bus(profile), "interferometer": _port(profile)}
+    needed = {"hardware": ("CAN", "interferometer"), RIG_DRIVES: ("interferometer",), RIG_SENSOR: ("CAN",)}
+    return dict(found[part] for part in needed.get(backend, ()))
+
+
+def _port(profile: Profile) -> tuple[str, bool]:
+    return f"interferometer {profile.interferometer.port}", Path(profile.interferometer.port).exists()
+
+
+def _bus(profile: Profile) -> tuple[str, bool]:
     if profile.can.interface == "socketcan":
         try:
             socket.if_nametoindex(profile.can.channel)
@@ -26,10 +36,7 @@ def present(profile: Profile) -> dict[str, bool]:
             has_bus = False
     else:
         has_bus = Path(profile.can.channel).exists()
-    return {
-        f"CAN {profile.can.interface} {profile.can.channel}": has_bus,
-        f"interferometer {profile.interferometer.port}": Path(profile.interferometer.port).exists(),
-    }
+    return f"CAN {profile.can.interface} {profile.can.channel}", has_bus
 
 
 def choose(profile: Profile, backend: str) -> str:
@@ -75,9 +82,9 @@ def open_stage(
         truth_of = machine if machine is not None else machine_path_for(profile.name)
         progress(f"opening {chosen}", 0.0)
         world = (
-            RigBackend(profile, truth_of, seed=seed)
-            if chosen == "rig"
-            else BatchBackend(load_machine(truth_of), seed=seed)
+            BatchBackend(load_machine(truth_of), seed=seed)
+            if chosen == "batch"
+            else RigBackend(profile, truth_of, seed=seed, plays=chosen)
         )
     facts = {
         **(manifest or {}),

@@ -4,6 +4,7 @@ import getpass
 import os
 import secrets
 import socket as sockets
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -290,8 +291,6 @@ def _still_ours(seen: messages.Status, holder: str) -> None:
 
 def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> Answer:
     """Show what is recorded, begin a run, or end the one that was asked for."""
-    import time
-
     with connected(socket) as stage:
         if end or name is not None:
             if end:
@@ -305,6 +304,22 @@ def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> An
         text = f"{found.run}, begun by {found.trigger}" if found.run else "the last seconds only, in memory"
     shown = [escape(text), *([f"[red]{escape(found.trouble)}[/]"] if found is not None and found.trouble else [])]
     return Answer({"recording": None if found is None else found.model_dump()}, shown)
+
+
+def trigger(voice: Voice, socket: Path | None, body: dict | None, reversal: bool, end: bool) -> Answer:
+    """Show which event is waited for, set one, or end that."""
+    if reversal and body is not None and (body["error_m"] is not None or body["contact_force_n"] is not None):
+        raise RequestError("--reversal and a level are both given; give one of them")
+    with connected(socket) as stage:
+        if end:
+            stage.end_trigger()
+        elif body is not None:
+            stage.set_trigger(messages.SetTrigger.model_validate(checked("SetTrigger", **body).model_dump()))
+        if end or body is not None:
+            time.sleep(_POLL_S)
+        found = stage.status().recording
+    waits_for = "" if found is None else found.waits_for
+    return Answer({"waits_for": waits_for}, [f"waits for {waits_for}" if waits_for else "waits for no event"])
 
 
 def backend(voice: Voice, socket: Path | None, token: str | None, name: str | None) -> Answer:

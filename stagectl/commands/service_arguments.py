@@ -16,8 +16,8 @@ ServedProfile = Annotated[
 ServedBackend = Annotated[
     str,
     option(
-        "auto | hardware | rig. auto takes the rig only where neither the profile's CAN interface nor its serial port "
-        "exists, once, and says so.",
+        "auto | hardware | rig | rig-drives | rig-sensor. auto takes the rig only where neither the profile's CAN "
+        "interface nor its serial port exists, once, and says so.",
         "--backend",
         metavar="WORLD",
     ),
@@ -42,8 +42,17 @@ LooksCount = Annotated[int | None, option("End after so many looks (default: Ctr
 DoAcknowledge = Annotated[bool, option("Take note of it; enables nothing.", "--acknowledge")]
 Hold = Annotated[bool, option("Take the lease and hold it until Ctrl-C.", "--hold")]
 RecordName = Annotated[str | None, option("Begin a run of this name.", "--name", metavar="NAME")]
+TriggerError = Annotated[float | None, option("An error above this.", "--error-m")]
+TriggerContact = Annotated[float | None, option("A contact with more than this.", "--contact-force-n")]
+TriggerReversal = Annotated[bool, option("A reversal.", "--reversal")]
+TriggerBefore = Annotated[float, option("How much before it.", "--before-s")]
+TriggerAfter = Annotated[float, option("How much after it.", "--after-s")]
+TriggerCount = Annotated[int, option("How often.", "--count", min=1, max=1000)]
+EndTrigger = Annotated[bool, option("Wait for no event any more.", "--end")]
 EndRecord = Annotated[bool, option("End the run that was asked for.", "--end")]
-World = Annotated[str | None, typer.Argument(help="auto | hardware | rig.", metavar="[WORLD]")]
+World = Annotated[
+    str | None, typer.Argument(help="auto | hardware | rig | rig-drives | rig-sensor.", metavar="[WORLD]")
+]
 ScanFile = Annotated[Path, typer.Argument(help="TOML: repeat_count, start_m, [[segments]].", metavar="PROGRAM.toml")]
 TableFile = Annotated[Path, typer.Argument(help="CSV with the header t_s,position_m.", metavar="FILE.csv")]
 Period = Annotated[float, option("Time from one position to the next, s.", "--period-s", min=1e-4, max=1.0)]
@@ -120,6 +129,27 @@ def backend(world: World = None, lease: LeaseToken = None, socket: Socket = None
 def record(name: RecordName = None, end: EndRecord = False, socket: Socket = None, json: Json = False) -> None:
     """Show what the service records, begin a run, or end it; powered motions are recorded without asking."""
     deliver("record", json, lambda voice: commands.remote.record(voice, socket, name, end), compiles=False)
+
+
+@service_app.command(
+    epilog=epilog("stagectl trigger --error-m 1e-6 --count 10", "stagectl trigger --reversal", "stagectl trigger --end")
+)
+def trigger(
+    error_m: TriggerError = None,
+    contact_force_n: TriggerContact = None,
+    reversal: TriggerReversal = False,
+    before_s: TriggerBefore = 1.0,
+    after_s: TriggerAfter = 1.0,
+    count: TriggerCount = 1,
+    end: EndTrigger = False,
+    socket: Socket = None,
+    json: Json = False,
+) -> None:
+    """Record what is around an event: an error above a level, a contact, a reversal; or show and end that."""
+    values = {"error_m": error_m, "contact_force_n": contact_force_n}
+    asked = reversal or any(value is not None for value in values.values())
+    body = {**values, "before_s": before_s, "after_s": after_s, "count": count} if asked else None
+    deliver("trigger", json, lambda voice: commands.remote.trigger(voice, socket, body, reversal, end), compiles=False)
 
 
 @service_app.command(epilog=epilog("stagectl log --lines 50"))

@@ -242,6 +242,18 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
         desk.ask_to_record("")
         return desk.status()
 
+    @app.put("/v1/record/trigger", status_code=202, dependencies=_OPERATES)
+    async def set_trigger(body: messages.SetTrigger) -> messages.Status:
+        """Record what is around an event, beside whatever else is recorded. Needs no lease."""
+        desk.set_trigger(body)
+        return desk.status()
+
+    @app.delete("/v1/record/trigger", status_code=202, dependencies=_OPERATES)
+    async def end_trigger() -> messages.Status:
+        """Wait for no event any more. Needs no lease."""
+        desk.set_trigger(None)
+        return desk.status()
+
     @app.get("/v1/commands/{key}", responses={404: {"model": messages.Failure}})
     async def command(
         key: messages.Key, wait_s: Annotated[float, Query(ge=0.0, le=_WAIT_MOST_S, allow_inf_nan=False)] = 0.0

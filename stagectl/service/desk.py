@@ -131,6 +131,7 @@ class Desk:
         self._stop_reason = ""
         self._stop = threading.Event()
         self._record_request: str | None = None
+        self._trigger_request: messages.SetTrigger | str | None = None
         self._closed = False
         self._status: messages.Status | None = None
         self._state = State.OFF
@@ -192,6 +193,14 @@ class Desk:
             return None
         with self._lock:
             asked, self._record_request = self._record_request, None
+            return asked
+
+    def next_trigger_request(self) -> messages.SetTrigger | str | None:
+        """Take the event that somebody wants recorded, "" where none any more; None where nobody asked."""
+        if self._trigger_request is None:
+            return None
+        with self._lock:
+            asked, self._trigger_request = self._trigger_request, None
             return asked
 
     # ---- what clients do -------------------------------------------------------------------------------------
@@ -258,6 +267,26 @@ class Desk:
                 raise Busy("there is nothing to record: the stage is not connected")
             self._record_request = name
             self._log.say("record", name or "end")
+
+    def set_trigger(self, body: messages.SetTrigger | None) -> None:
+        """Wait for an event to record, or for none any more; needs no lease. Errors: Busy, Ending, Unfit."""
+        with self._lock:
+            self._refuse_when_closed()
+            profile = self.profile
+            if body is not None and profile is None:
+                raise Busy("there is nothing to record: the stage is not connected")
+            if body is not None and profile is not None:
+                if body.error_m is not None and body.contact_force_n is not None:
+                    raise Unfit("error_m and contact_force_n are both given; give one, or none for a reversal")
+                if profile.record.when == "always":
+                    raise Unfit("record.when is always: the whole session is one run already; look into that")
+                if not body.before_s + body.after_s <= profile.record.flight_s:
+                    raise Unfit(
+                        f"before_s + after_s are {body.before_s + body.after_s:g} s, record.flight_s keeps "
+                        f"{profile.record.flight_s:g} s; ask for less, or raise it"
+                    )
+            self._trigger_request = "" if body is None else body
+            self._log.say("trigger", "none" if body is None else body.name)
 
     def _drop_waiting(self, reason: str) -> None:
         waiting, self._waiting = self._waiting, None

@@ -8,12 +8,15 @@ import numpy as np
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
+from stagectl.profile import Profile, frame_bits
+from stagectl.row import FRAMES
 from stagectl.service.messages import Status
 from stagectl.service.states import State
 
 LATENESS_BOUNDS_S = (10e-6, 20e-6, 50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3)
 AGE_BOUNDS_S = (0.2e-3, 0.3e-3, 0.4e-3, 0.5e-3, 0.7e-3, 1e-3, 2e-3, 3e-3, 5e-3, 10e-3, 20e-3, 50e-3)
 _RECENT = 4096
+_LOAD_SHARE = 0.02  # of a piece of 20 ms
 
 
 class _Tally:
@@ -46,11 +49,15 @@ class Figures:
         self._cycles = self._missed = self._lost = self._refused = 0
         self._last_missed = self._last_lost = 0
         self._faults: Counter[str] = Counter()
+        self._profile: Profile | None = None
+        self._load: float | None = None
+        self._load_t_ns = 0
 
-    def begin_servo(self) -> None:
+    def begin_servo(self, profile: Profile | None = None) -> None:
         """A new servo counts from 0."""
         with self._lock:
             self._last_missed = self._last_lost = 0
+            self._profile, self._load, self._load_t_ns = profile, None, 0
 
     def add(self, rows: np.ndarray) -> None:
         """Count rows, shape (n,) of ROW."""
@@ -70,6 +77,21 @@ class Figures:
             self._missed += max(missed - self._last_missed, 0)
             self._lost += max(lost - self._last_lost, 0)
             self._last_missed, self._last_lost = missed, lost
+            self._add_load(rows)
+
+    def _add_load(self, rows: np.ndarray) -> None:
+        """Count the bits of the cyclic frames that went over the bus, each as long as stuffing can make it."""
+        profile, now_t_ns = self._profile, int(rows["t_ns"][-1])
+        before_t_ns, self._load_t_ns = self._load_t_ns, now_t_ns
+        if profile is None or before_t_ns == 0 or now_t_ns <= before_t_ns:
+            return
+        bits = profile.command_frames_bits * rows.size
+        for name in FRAMES:
+            lengths, counts = np.unique(rows[f"{name}_count"], return_counts=True)
+            pairs = zip(lengths.tolist(), counts.tolist(), strict=True)
+            bits += sum(frame_bits(length) * count for length, count in pairs if length >= 0)
+        load = bits * 1e9 / (now_t_ns - before_t_ns) / profile.can.bitrate_bit_per_s
+        self._load = load if self._load is None else self._load + _LOAD_SHARE * (load - self._load)
 
     def fault(self, kind: str) -> None:
         """Count a fault."""
@@ -93,6 +115,9 @@ class Figures:
             yield CounterMetricFamily("stagectl_cycles_missed", "Grid points that were skipped", value=self._missed)
             yield CounterMetricFamily("stagectl_samples_lost", "Samples of the sensor that were lost", value=self._lost)
             yield CounterMetricFamily("stagectl_commands_refused", "Cycles whose frames the bus refused", self._refused)
+            if self._load is not None:
+                text = "Share of the bus that cyclic frames take, worst-case stuffing, mean of about a second"
+                yield GaugeMetricFamily("stagectl_can_load_ratio", text, value=self._load)
             faults = CounterMetricFamily("stagectl_faults", "Stops by themselves, by kind", labels=["kind"])
             for kind, count in self._faults.items():
                 faults.add_metric([kind], count)

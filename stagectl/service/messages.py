@@ -130,13 +130,25 @@ class Probe(_Asked):
 class SwapBackend(_Asked):
     """Work in another world; only without power."""
 
-    backend: Literal["auto", "hardware", "rig"]
+    backend: Literal["auto", "hardware", "rig", "rig-drives", "rig-sensor"]
 
 
 class StartRecord(_Asked):
     """Begin a run on request."""
 
     name: RunName = "request"
+
+
+class SetTrigger(_Asked):
+    """Record what is around an event: an error above a level, a contact above a force; without either, a reversal."""
+
+    name: RunName = "trigger"
+    error_m: Annotated[Finite, Field(gt=0.0, le=1.0)] | None = None
+    contact_force_n: Annotated[Finite, Field(gt=0.0, le=1e6)] | None = None
+    before_s: Annotated[Finite, Field(ge=0.0, le=600.0)] = 1.0
+    after_s: Annotated[Finite, Field(ge=0.0, le=600.0)] = 1.0
+    count: Annotated[int, Field(ge=1, le=1000)] = 1
+    """How often it may."""
 
 
 class Acknowledge(_Asked):
@@ -245,6 +257,8 @@ class Recording(BaseModel):
     rows_count: int
     trouble: str
     """What the disk refuses; empty where all is well."""
+    waits_for: str = ""
+    """The event that is waited for, and how often still; empty where none is."""
 
 
 class Health(BaseModel):

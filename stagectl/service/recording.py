@@ -7,10 +7,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from stagectl.errors import RecordError, RequestError
 from stagectl.flight_recorder import FlightRecorder
 from stagectl.profile import Profile
 from stagectl.record import Recorder, read_manifest
+from stagectl.recording_trigger import Trigger, TriggerWatch
 from stagectl.retention import prune
 from stagectl.run_folder import reserve
 from stagectl.service import messages
@@ -30,6 +33,10 @@ class Recording:
         self._over = threading.Event()
         self._profile: Profile | None = None
         self._pruning: threading.Thread | None = None
+        self._asked: messages.SetTrigger | None = None
+        self._watch: TriggerWatch | None = None
+        self._left_count = 0
+        self._window: tuple[int, int] | None = None  # rows of the session, the end of which is still to come
 
     def factory(self, profile: Profile) -> Callable[[Path, dict[str, Any]], Recorder | FlightRecorder]:
         """Return what makes the recorder of a session with this profile."""
@@ -95,6 +102,36 @@ class Recording:
         if folder is not None:
             self._log.say("run", "the last seconds", run=folder.name, trigger=kind)
 
+    def wait_for(self, asked: messages.SetTrigger | None) -> None:
+        """Wait for an event to record, or for none any more."""
+        self._asked, self._window = asked, None
+        self._watch = None if asked is None else TriggerWatch(Trigger(asked.error_m, asked.contact_force_n))
+        self._left_count = 0 if asked is None else asked.count
+
+    def observe(self, rows: np.ndarray) -> None:
+        """Look for the event in rows, shape (n,) of ROW, that the recorder takes next."""
+        flight, watch, asked, profile = self._flight, self._watch, self._asked, self._profile
+        if flight is None or watch is None or asked is None or profile is None:
+            return
+        found = watch.first(rows)
+        if found is not None and self._window is None and self._left_count > 0:
+            row, rate_hz = flight.rows_count + found, profile.cycle.rate_hz
+            self._window = row - round(asked.before_s * rate_hz), row + 1 + round(asked.after_s * rate_hz)
+
+    def save_event(self) -> None:
+        """Write what is around the event as a run, once its end is there."""
+        flight, asked, watch, window = self._flight, self._asked, self._watch, self._window
+        if flight is None or asked is None or watch is None or window is None or flight.rows_count < window[1]:
+            return
+        self._window, self._left_count = None, self._left_count - 1
+        try:
+            folder = flight.save_window(f"service-{asked.name}", watch.trigger.text, *window)
+        except RecordError as error:
+            self._log.say("record_lost", str(error))
+            return
+        if folder is not None:
+            self._log.say("run", "around an event", run=folder.name, trigger=watch.trigger.text)
+
     def folder(self, session: Path) -> Path:
         """Return the run that rows go to now, the session's own folder where there is none."""
         flight = self._flight
@@ -115,11 +152,15 @@ class Recording:
             trigger=flight.trigger,
             rows_count=flight.run_rows_count,
             trouble=flight.trouble,
+            waits_for="" if self._watch is None else self._waits_for(self._watch),
         )
+
+    def _waits_for(self, watch: TriggerWatch) -> str:
+        return f"{watch.trigger.text}, {self._left_count} times" if self._left_count > 0 else ""
 
     def forget(self) -> None:
         """The session is over."""
-        self._recorder = None
+        self._recorder = self._window = None
 
     def discard(self, session: Path) -> None:
         """Remove the folder of a session that did not come about, where it holds no row."""

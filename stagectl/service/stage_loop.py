@@ -18,6 +18,7 @@ from stagectl.service.stage_watch import StageWatch
 from stagectl.service.stage_world import Leaving
 from stagectl.service.states import Event, State
 from stagectl.service.view import BANNERS, backlash_message
+from stagectl.session import WATCHED_ONLY
 from stagectl.signals import Stop
 from stagectl.stage import choose
 from stagectl.wear import IDENTIFIED, PROBE
@@ -120,6 +121,8 @@ class StageLoop(StageWatch):
         """Do a motion and bring the state into line with how it ended."""
         motion, stage = MOTIONS[order.name], self._connected()
         states.after(self._state, motion.event)
+        if not stage.backend.may_move:
+            raise RequestError(f"{order.name}: {WATCHED_ONLY}")
         if motion.needs_homing and not self._homed:
             raise RequestError(f"{order.name}: the stage is not homed since it was connected; home it first")
         stage.allow_motion()

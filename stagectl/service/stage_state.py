@@ -106,6 +106,10 @@ class StageState:
 
     def _heed_record_requests(self) -> None:
         """Begin or end a run that a client asked for; motions go on meanwhile."""
+        trigger = self.desk.next_trigger_request()
+        if trigger is not None:
+            self._recording.wait_for(None if isinstance(trigger, str) else trigger)
+        self._recording.save_event()
         asked, stage = self.desk.next_record_request(), self._stage
         if asked is None or stage is None or self._opening:
             return

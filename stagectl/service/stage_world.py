@@ -68,7 +68,7 @@ class StageWorld(StageState):
                 record=self._recording.factory(profile),
             )
             folder = stage.folder
-            self._figures.begin_servo()
+            self._figures.begin_servo(profile)
             self._scope = Scope(profile.cycle.rate_hz)
             self.desk.scope = self._scope
             stage.__enter__()
@@ -143,6 +143,7 @@ class StageWorld(StageState):
     def _observe(self, rows: np.ndarray) -> None:
         self._scope.add(rows)
         self._figures.add(rows)
+        self._recording.observe(rows)
         if self._wear is not None:
             self._wear.observe(rows)
 

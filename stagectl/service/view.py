@@ -12,6 +12,8 @@ from stagectl.service import messages
 BANNERS = {
     "hardware": "HARDWARE: what moves here is real",
     "rig": "SOFTWARE RIG: nothing real moves",
+    "rig-drives": "MIXED: simulated drives on a real interferometer; nothing real moves",
+    "rig-sensor": "MIXED: real drives on a SIMULATED interferometer; to be watched only, nothing may be armed",
     "batch": "SOFTWARE RIG in virtual time: nothing real moves",
 }
 """Which world this is, for every client to show."""

@@ -12,11 +12,11 @@ _SHARED_MEMORY = Path("/dev/shm")
 
 def missing(profile: Profile, backend: str, runs_root: Path) -> str:
     """Say what hardware is not there, or who still has it; empty where all is ready."""
-    if backend != "hardware":
-        return ""
-    absent = [name for name, there in present(profile).items() if not there]
+    absent = [name for name, there in present(profile, backend).items() if not there]
     if absent:
         return f"{', '.join(absent)}: not there; plug it in, or ask for another backend"
+    if not present(profile, backend):
+        return ""
     for ring in sorted(_SHARED_MEMORY.glob("stagectl-*.ring")):
         try:
             reader = RingReader(ring)

@@ -1,5 +1,6 @@
 """The command line through a service: the same words, one stage, and who holds the lease."""
 
+import io
 import json
 import os
 import pty
@@ -60,6 +61,41 @@ def test_what_can_t_be_is_refused_with_its_place_and_remedy(call):
     code, answer = call("jog", "--keys")
     assert code == 2
     assert "needs a terminal" in answer["error"]["message"]
+
+
+def test_scans_tables_and_streams_go_through_the_service(call, tmp_path, monkeypatch):
+    program = tmp_path / "raster.toml"
+    program.write_text(
+        "repeat_count = 2\nstart_m = 0\n[[segments]]\ntarget_m = 0.002\n[[segments]]\ntarget_m = 0.001\n"
+    )
+    code, answer = call("scan", program)
+    assert (code, answer["stop"]) == (0, "FINISHED")
+    assert answer["end_position_m"] == pytest.approx(0.001, abs=3e-4)
+    table = tmp_path / "motion.csv"
+    table.write_text("t_s,position_m\n0,0.001\n0.5,0.0015\n1,0.002\n")
+    code, answer = call("follow", table)
+    assert (code, answer["stop"]) == (0, "FINISHED")
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n".join("0.002" for _ in range(50))))
+    code, answer = call("stream", "--period-s", 0.02)
+    assert (code, answer["stop"]) == (0, "FINISHED")
+
+
+def test_what_is_no_program_is_refused_with_its_place(call, tmp_path, monkeypatch):
+    file = tmp_path / "wrong"
+    for command, text, said in (
+        ("scan", "repeat_count = 1", "segments"),
+        ("scan", "[[segments]]\ntarget_mm = 3", "segments.0.target_m"),
+        ("scan", "[[segments", "give a readable TOML file"),
+        ("scan", "[[segments]]\ntarget_m = 3.0", "position_m is"),
+        ("follow", "t,x\n0,1", "it must be 't_s,position_m'"),
+        ("follow", "t_s,position_m\n0,0\n1,100", "are these millimetres?"),
+    ):
+        file.write_text(text)
+        code, answer = call(command, file)
+        assert (code, said in answer["error"]["message"]) == (2, True), answer
+    monkeypatch.setattr("sys.stdin", io.StringIO("x"))
+    code, answer = call("stream")
+    assert (code, "line 1 is 'x'" in answer["error"]["message"]) == (2, True)
 
 
 def test_a_lease_that_somebody_holds_is_worked_under_or_respected(idle, call):

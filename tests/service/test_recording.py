@@ -18,6 +18,7 @@ from stagectl.row import new_rows
 from stagectl.run_folder import reserve
 from stagectl.runs import list_runs
 from stagectl.service import messages
+from stagectl.service.desk import Unfit
 from tests.service.test_stage_loop import Bench
 from tests.small_disk import small_disk
 from tests.toml_text import changed
@@ -248,3 +249,53 @@ def test_a_list_of_runs_need_not_read_what_is_just_recorded(tmp_path):
     session.close()
     closed = {run.folder.name.split("-")[-1]: run for run in list_runs(tmp_path, count_under_way=False)}
     assert (closed["motion"].state, closed["motion"].rows_count) == ("closed", 5000)
+
+
+def test_a_window_of_the_session_is_a_run_of_its_own(tmp_path):
+    session = flight(tmp_path)
+    for first in range(0, 300, 20):
+        session.append(rows_from(first, 20))
+    session.event("emergency", 250 * MS_NS, code=3)
+    saved = session.save_window("event", "reversal", 230, 270)
+    assert read_run(saved).rows["cycle"].tolist() == list(range(230, 270))
+    early = session.save_window("event", "reversal", -50, 210)
+    assert read_run(early).rows["cycle"].tolist() == list(range(200, 210))
+    assert session.save_window("event", "reversal", 0, 100) is None  # not kept any more
+    session.close()
+
+
+def test_what_is_around_an_event_is_recorded_as_often_as_asked(tmp_path):
+    bench = Bench(tmp_path)
+    bench.until(lambda: bench.loop._state == "idle")
+    bench.loop.step()
+    for body, said in (
+        (messages.SetTrigger(error_m=1e-3, contact_force_n=1.0), "both given"),
+        (messages.SetTrigger(before_s=500.0), r"are 501 s, record.flight_s keeps 30 s"),
+    ):
+        with pytest.raises(Unfit, match=said):
+            bench.desk.set_trigger(body)
+    bench.desk.set_trigger(messages.SetTrigger(error_m=1e-3, before_s=0.05, after_s=0.1, count=2, name="late"))
+    bench.loop.step()
+    assert bench.status.recording.waits_for == "error above 0.001 m, 2 times"
+    observe = bench.loop._observe
+
+    def late(rows):
+        rows = rows.copy()
+        rows["run_phase"] = int(Phase.TRACKING)
+        rows["setpoint_position_m"] = 0.0
+        rows["end_position_m"] = np.where(rows["cycle"] // 100 % 3 == 1, 2e-3, 0.0)
+        observe(rows)
+
+    bench.loop._stage._observe = late
+    for _ in range(60):
+        bench.loop.step()
+    assert bench.status.recording.waits_for == ""
+    runs = sorted((tmp_path / "runs").glob("*-service-late*"))
+    assert len(runs) == 2
+    for folder in runs:
+        run = read_run(folder)
+        assert run.rows.size == 151
+        assert run.rows["cycle"][50] % 300 == 100
+        assert run.manifest["trigger"] == "error above 0.001 m"
+    bench.loop.leave()
+    bench.loop.run()

@@ -21,6 +21,8 @@ from stagectl.signals import SETPOINT
 from stagectl.wear import IDENTIFIED, LOOKS_COUNT
 from tests.struck_stage import Stage
 
+JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
+
 
 def joint(profile, **changes):
     """The profile's own joint as a sure estimate, with changes."""
