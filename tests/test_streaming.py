@@ -129,6 +129,17 @@ def test_limits_are_named():
         SetpointBuffer(0.0, 0.0015, ROOM, DT_S)
 
 
+def test_a_stream_that_could_stop_hard_but_not_brake_gently_before_the_end_is_refused():
+    times_s = [i * PERIOD_S for i in range(200)]
+    # to 0.1 m/s within 0.3 s, on to 5 mm before the end: 2.5 mm for the drive's ramp, 10 mm for the jerk-limited brake
+    ways = [0.1 * (t**2 / 0.6 if t < 0.3 else t - 0.15) for t in times_s]
+    positions = [0.4 + way for way in ways if way < 0.0445]
+    with pytest.raises(
+        RequestError, match=r"set-point \d+: braking from there ends at 0.45\d* m, beyond the travel .*: go slower"
+    ):
+        SetpointBuffer(0.4, PERIOD_S, ROOM, DT_S).take(0, positions)
+
+
 def test_the_buffer_is_bounded():
     buffer = new()
     most = buffer.room_count
@@ -153,3 +164,5 @@ def test_what_comes_after_the_end_is_late():
     ended.take(0, swing(), last=True)
     with pytest.raises(RequestError, match="299 was said to be the last one"):
         ended.take(300, [0.0])
+    ended.close("stopped")
+    assert not ended.ended  # its last set-points were never followed
