@@ -48,7 +48,8 @@ class Admission:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass one request on, or refuse it."""
         is_stop = scope["type"] == "http" and scope.get("path") == _STOP_PATH and scope.get("method") == "POST"
-        if is_stop or self._connections_count() <= CONNECTIONS_LIMIT:
+        is_client = scope["type"] in ("http", "websocket")
+        if is_stop or not is_client or self._connections_count() <= CONNECTIONS_LIMIT:
             await self._application(scope, receive, send)
         elif scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1013, "reason": _TEXT[:120]})
