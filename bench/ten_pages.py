@@ -1,7 +1,9 @@
 """Ten pages open against none: does the servo miss more cycles? Real processes, windows in turn.
 
 A pair of windows lies close together in time, and which comes first changes, so that what else the host does meets both
-alike. The verdict is Wilcoxon's on the pairs: no bell curve is assumed, a burst of misses counts as one pair.
+alike. Servo and rig have a processor of their own, as a stage PC gives the servo one: a browser beside them on the same
+processor is a load like any other program. The verdict is Wilcoxon's on the pairs: no bell curve is assumed, a burst
+of misses counts as one pair.
 """
 
 import asyncio
@@ -132,6 +134,8 @@ def _greatest_rare_sum(count: int) -> int:
 
 
 def _lacking() -> str:
+    if len(os.sched_getaffinity(0)) < 2:
+        return "one processor only: a browser would take the servo's"
     if chromium_path() is None:
         return "no Chromium here: apt install chromium"
     try:
@@ -151,6 +155,11 @@ class _Stage:
         self.folder = folder
         self.daemon = Daemon(folder)
         _await(self._is_idle, "a stage that is connected", _COMPILE_S)
+        self._processors = os.sched_getaffinity(0)
+        for pid in _children(self.daemon.process.pid):
+            for task in Path(f"/proc/{pid}/task").iterdir():
+                os.sched_setaffinity(int(task.name), {max(self._processors)})
+        os.sched_setaffinity(0, self._processors - {max(self._processors)})  # and what is started from here on
         self._lease = contextlib.ExitStack()
         self.hold()
 
@@ -161,6 +170,7 @@ class _Stage:
 
     def close(self) -> None:
         """End the service."""
+        os.sched_setaffinity(0, self._processors)
         self._lease.close()
         self.daemon.end()
 
@@ -196,6 +206,11 @@ class _Stage:
             end_s - begin_s,
             held and before.state == after.state == "armed",
         )
+
+
+def _children(pid: int) -> list[int]:
+    """Return the processes that one started: servo and rig."""
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 def _pair(stage: _Stage, window_s: float, pages_first: bool) -> tuple[Window, Window]:

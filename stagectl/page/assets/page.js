@@ -118,7 +118,7 @@ function showHealth(status) {
 function showFault(fault) {
   byId('fault').hidden = !fault;
   if (!fault) return;
-  write('fault-what', fault.what);
+  write('fault-what', `${fault.what}:`);
   write('fault-values', fault.values);
   write('fault-remedy', `What to do: ${fault.remedy}.`);
   write('fault-at', `${fault.kind}, fault ${fault.number}, ${clock(fault.at)}, while ${fault.state}`);
