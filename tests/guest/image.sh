@@ -11,24 +11,27 @@ umask 022
 SOURCE=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 HERE=$SOURCE/tests/guest
 FOLDER=$(realpath -m "$1")
+HOST_PYTHON=${PYTHON:-python3}
 PARTS=(stagectl drivers sim_backend profiles docs deploy pyproject.toml README.md CHANGELOG.md LICENSE) # of install.sh
 PACKAGES=systemd,systemd-sysv,udev,dbus,kmod,iproute2,python3,python3-venv,procps,util-linux
 MODULES=(net/can drivers/net/can fs/9p net/9p fs/netfs fs/fscache fs/ext4 fs/jbd2 drivers/virtio drivers/block drivers/usb
   drivers/char drivers/tty crypto lib arch/x86/crypto)
+# Nothing of this host's settings for Python and pip.
+CLEAN=(env -i HOME=/root LANG=C.UTF-8 PATH=/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin)
 # Compiled code for every x86-64: the processor that qemu plays is not this one.
-GENERIC=(STAGECTL_CACHE=/srv/cache NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= OPENBLAS_NUM_THREADS=1 HOME=/root)
+GENERIC=("${CLEAN[@]}" STAGECTL_CACHE=/srv/cache NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= OPENBLAS_NUM_THREADS=1)
 
 say() { printf '%4d s  %s\n' "$SECONDS" "$*"; }
 hash_of() { sha256sum | cut -c1-12; }
 dependencies() { # of the project, one a line
-  "${PYTHON:-python3}" -c 'import sys, tomllib
+  "$HOST_PYTHON" -c 'import sys, tomllib
 print(*tomllib.load(open(sys.argv[1], "rb"))["project"]["dependencies"], sep="\n")' "$SOURCE/pyproject.toml"
 }
 sources() { (cd "$SOURCE" && find "${PARTS[@]}" -type f ! -path '*/__pycache__/*' ! -path '*.egg-info*' -print0 | LC_ALL=C sort -z); }
 
 MOUNTED=
 unmount() {
-  [ -z "$MOUNTED" ] || umount "$MOUNTED/dev/shm" "$MOUNTED/dev" "$MOUNTED/proc"
+  [ -z "$MOUNTED" ] || umount "$MOUNTED/dev/shm" "$MOUNTED/dev/pts" "$MOUNTED/dev" "$MOUNTED/proc"
   MOUNTED=
 }
 trap unmount EXIT
@@ -36,6 +39,7 @@ mount_in() {
   MOUNTED=$1
   mount -t proc proc "$1/proc"
   mount --bind /dev "$1/dev"
+  mount --bind /dev/pts "$1/dev/pts"
   mount -t tmpfs tmpfs "$1/dev/shm"
 }
 
@@ -92,7 +96,7 @@ INIT
   say "the Python packages, for a PC without internet"
   mkdir -p "$root/srv/wheels"
   mapfile -t needed < <(dependencies)
-  "${PYTHON:-python3}" -m pip download -q --disable-pip-version-check --only-binary=:all: --dest "$root/srv/wheels" \
+  "$HOST_PYTHON" -m pip download -qq --disable-pip-version-check --only-binary=:all: --dest "$root/srv/wheels" \
     --python-version 3.11 --platform manylinux_2_28_x86_64 --platform manylinux_2_27_x86_64 \
     --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 'setuptools>=77' wheel "${needed[@]}"
 
@@ -126,7 +130,7 @@ make_release_before() { # ROOT
   name=$(readlink "$root/opt/stagectl/current")
   cp -a "$root/srv/stagectl" "$root/srv/before"
   echo "The release before." >>"$root/srv/before/CHANGELOG.md"
-  before=$(DESTDIR=$root/srv/try "$root/srv/before/deploy/install.sh" install | sed -n 's/^release \(.*\) made$/\1/p')
+  before=$("${CLEAN[@]}" DESTDIR="$root/srv/try" "$root/srv/before/deploy/install.sh" install | sed -n 's/^release \(.*\) made$/\1/p')
   rm -r "$root/srv/try"
   cp -al "$root/opt/stagectl/$name" "$root/opt/stagectl/$before"
   cp --remove-destination "$root/srv/before/CHANGELOG.md" "$root/opt/stagectl/$before/"
@@ -142,17 +146,17 @@ make_disk() { # BASE TO
   mkdir -p "$root/srv/stagectl"
   (cd "$SOURCE" && sources | tar --null -c -T -) | tar -C "$root/srv/stagectl" -x
   mount_in "$root"
-  chroot "$root" /srv/stagectl/deploy/install.sh install --wheels /srv/wheels
+  chroot "$root" "${CLEAN[@]}" /srv/stagectl/deploy/install.sh install --wheels /srv/wheels
   say "compiled"
   mkdir "$root/srv/guest"
   cp "$HERE"/{warm.py,stage-100hz.toml,machine.toml} "$root/srv/guest/"
-  chroot "$root" env "${GENERIC[@]}" /opt/stagectl/current/venv/bin/python /srv/guest/warm.py /srv/runs
+  chroot "$root" "${GENERIC[@]}" /opt/stagectl/current/venv/bin/python /srv/guest/warm.py /srv/runs
   unmount
   make_release_before "$root"
   # The releases stay, so that nothing has to be unpacked under emulation; all else is the guest's own to install.
   mv "$root/opt/stagectl" "$root/srv/releases"
   rm "$root/srv/releases/current"
-  chroot "$root" /srv/stagectl/deploy/install.sh uninstall --yes
+  chroot "$root" "${CLEAN[@]}" /srv/stagectl/deploy/install.sh uninstall --yes
   rm -r "$root/srv/wheels"
   say "the disk"
   truncate -s $(($(du -sm "$root" | cut -f1) + 700))M "$FOLDER/disk.part"

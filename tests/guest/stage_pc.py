@@ -48,7 +48,7 @@ class Report:
     def check(self, what: str, holds: object, found: object = "") -> bool:
         """Print what was looked at and what was found."""
         self.count += 1
-        self.say(f"{'ok    ' if holds else 'FAILED'}  {what}{f': {found}' if found != '' else ''}")
+        self.say(f"{'ok    ' if holds else 'FAILED'}  {what}{f': {found}' if found not in ('', [], None) else ''}")
         if not holds:
             self.failed.append(what)
         return bool(holds)
