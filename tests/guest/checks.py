@@ -106,7 +106,7 @@ def upgraded() -> None:
 
 def starts() -> None:
     """Drives and interferometer appear; the stage is opened."""
-    shutil.copytree("/srv/cache", "/var/cache/stagectl", dirs_exist_ok=True)
+    shell("tar", "-xf", "/srv/cache.tar", "-C", "/var/cache/stagectl")
     shell("chown", "-R", "stagectl:stagectl", "/var/cache/stagectl")
     stage_pc.start_rig()
     status = stage.await_state("idle", patience_s=300.0)
@@ -180,6 +180,15 @@ def moving() -> Iterator[None]:
         here_m = stage.status()["positions"]["end_position_m"]
         stage.begin("move", target_m=FAR_M if here_m < 0.5 * FAR_M else BACK_M)
         until("full speed", lambda: abs(rig()["plant"]["macro_velocity_m_per_s"]) > 0.03, 20.0)
+        yield
+
+
+@contextmanager
+def homing() -> Iterator[None]:
+    """A stage whose macro drive looks for its index by itself; the lease is held."""
+    with stage.lease():
+        stage.begin("home")
+        until("the drive moves", lambda: abs(rig()["plant"]["macro_velocity_m_per_s"]) > 0.01, 60.0)
         yield
 
 
@@ -291,9 +300,9 @@ def kill_supervisor() -> None:
 
 
 def watchdog() -> None:
-    """The supervisor hangs: the servo stops the stage, the watchdog ends the service, systemd brings it back."""
+    """The supervisor hangs while the drive homes: the stage stops, the watchdog ends the service, and it restarts."""
     before = restarts_before()
-    with moving():
+    with homing():
         began_s = time.monotonic()
         os.kill(int(unit("MainPID")), signal.SIGSTOP)
         stops("supervisor hangs", began_s)
@@ -304,9 +313,9 @@ def watchdog() -> None:
 
 
 def out_of_memory() -> None:
-    """The kernel kills for want of memory: the drives stop the stage, systemd brings the service back."""
+    """The kernel kills for want of memory while the drive homes: the stage stops, systemd restarts the service."""
     before = restarts_before()
-    with moving():
+    with homing():
         began_s = time.monotonic()
         shell("systemctl", "set-property", "--runtime", UNIT, "MemoryMax=64M")
         stops("out of memory", began_s)

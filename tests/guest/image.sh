@@ -19,7 +19,7 @@ MODULES=(net/can drivers/net/can fs/9p net/9p fs/netfs fs/fscache fs/ext4 fs/jbd
 # Nothing of this host's settings for Python and pip.
 CLEAN=(env -i HOME=/root LANG=C.UTF-8 PATH=/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin)
 # Compiled code for every x86-64: the processor that qemu plays is not this one.
-GENERIC=("${CLEAN[@]}" STAGECTL_CACHE=/srv/cache NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= OPENBLAS_NUM_THREADS=1)
+GENERIC=("${CLEAN[@]}" STAGECTL_CACHE=/var/cache/stagectl NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= OPENBLAS_NUM_THREADS=1)
 
 say() { printf '%4d s  %s\n' "$SECONDS" "$*"; }
 hash_of() { sha256sum | cut -c1-12; }
@@ -152,6 +152,8 @@ make_disk() { # BASE TO
   cp "$HERE"/{warm.py,stage-100hz.toml,machine.toml} "$root/srv/guest/"
   chroot "$root" "${GENERIC[@]}" /opt/stagectl/current/venv/bin/python /srv/guest/warm.py /srv/runs
   unmount
+  # Compiled code is known by its source's path and time of change, to the nanosecond, and mke2fs keeps whole seconds only.
+  tar --format=posix -C "$root/var/cache/stagectl" -cf "$root/srv/cache.tar" .
   make_release_before "$root"
   # The releases stay, so that nothing has to be unpacked under emulation; all else is the guest's own to install.
   mv "$root/opt/stagectl" "$root/srv/releases"

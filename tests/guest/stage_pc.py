@@ -205,7 +205,7 @@ def start_rig() -> list[subprocess.Popen]:
     shell("ip", "link", "add", "vcan0", "type", "vcan")
     shell("ip", "link", "set", "vcan0", "up")
     RIG_FOLDER.mkdir(exist_ok=True)
-    environment = {**os.environ, **GENERIC, "STAGECTL_CACHE": "/srv/cache", "OPENBLAS_NUM_THREADS": "1"}
+    environment = {**os.environ, **GENERIC, "STAGECTL_CACHE": "/var/cache/stagectl", "OPENBLAS_NUM_THREADS": "1"}
     line = RIG_FOLDER / "line"
     rig = [PYTHON, "-m", "sim_backend", str(HERE / "machine.toml"), "--socket", str(HUB), "--pty-link", str(line)]
     log = (RIG_FOLDER / "log").open("w")
