@@ -5,7 +5,7 @@ BIN := .venv/bin
 # PYTHONWARNINGS: what the build backend thinks of editable installs is no news to whoever types make.
 PIP_INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --disable-pip-version-check --retries 5 --timeout 60
 
-.PHONY: setup demo test check bench clean
+.PHONY: setup demo test check guest-test bench clean
 
 setup: .venv/.installed
 
@@ -38,6 +38,10 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+# Root: makes a disk image, kept in $XDG_CACHE_HOME/stagectl-guest, and boots it in qemu.
+guest-test: setup
+	PYTHON=$(CURDIR)/$(BIN)/python tests/guest/run.sh
 
 bench: setup
 	$(BIN)/python -m bench main_job --markdown docs/figures.md

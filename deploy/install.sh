@@ -209,6 +209,7 @@ uninstall() { # KEEP YES
   if has_systemd; then
     systemctl daemon-reload
     udevadm control --reload
+    udevadm trigger --action=add --subsystem-match=tty # the names that adapters have by our rules
   fi
   say "stagectl is uninstalled; $runs_count runs and $profiles_count profiles were ${keep:+copied to $keep and }deleted"
 }

@@ -115,6 +115,12 @@ BACKLASH = np.dtype(
     ]
 )
 
+FILTER_S = 0.015
+"""Time constant of the identification's filter at 1 kHz."""
+
+HOLD_RATIO = 7.0
+"""How long the joint is pressed before a sample of its side counts, in that time constant."""
+
 _FREE = 2.0  # a side that is none
 _BOTH = -1
 _MOVED_M = 0.3e-6  # of a line off its switch, beyond which the area of a knee is no longer what the pulse has
@@ -149,7 +155,7 @@ def believed_doubts(profile: "Profile") -> Doubts:
 
 def init(
     profile: "Profile",
-    filter_s: float = 0.015,
+    filter_s: float | None = None,
     doubts: Doubts | None = None,
     force_noise_n: float = 5e-3,
     edge_drift_m_per_sqrt_s: float | None = None,
@@ -159,14 +165,17 @@ def init(
     Without a drift of the edges the profile's wear table says how they may wander.
 
     In closed loop the sensors' noise moves the stage, and what moves it is then no longer independent of the residual:
-    at 100 nm a filter of 10 ms found a mass 2 % low, one of 15 ms finds it within its interval.
+    at 100 nm a filter of 10 ms found a mass 2 % low, one of 15 ms finds it within its interval. Without `filter_s` it
+    is the profile's.
     """
     b = np.zeros(1, BACKLASH)
+    if filter_s is None:
+        filter_s = FILTER_S if profile.backlash is None else profile.backlash.filter_s
     h = 1.0 / profile.cycle.rate_hz
     w = 1.0 / filter_s
     b["period_s"] = h
     b["corner_rad_per_s"] = w
-    b["hold_cycles"] = np.ceil(7.0 * filter_s / h)
+    b["hold_cycles"] = np.ceil(HOLD_RATIO * filter_s / h)
     b["settle_cycles"] = np.ceil(16.0 * filter_s / h)
     b["least_force_n"] = 0.3
     b["force_share_ratio"] = 0.1

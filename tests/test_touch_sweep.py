@@ -29,6 +29,13 @@ def greatest_force_n(joint: Joint, sweep: touch_sweep.TouchSweep, stiffness_n_pe
     return greatest_n
 
 
+def pressed_s(joint: Joint, sweep: touch_sweep.TouchSweep) -> float:
+    """Return how long a swing in the steady state stays on one side, by a fine table."""
+    half_m = 0.5 * (joint.left_m + joint.right_m)
+    pressed_count = sum(sweep.amplitude_m * math.sin(2.0 * math.pi * k / 100_000) > half_m for k in range(100_000))
+    return pressed_count / 100_000 / sweep.frequency_hz
+
+
 @pytest.mark.parametrize("share", [TOUCH_SHARE, IDENTIFY_SHARE])
 def test_a_damped_joint_is_pressed_with_the_touch_force_and_no_more(share):
     sweep = touch_sweep.plan(KANG, share, IDENTIFY_HZ, 20.0)
@@ -80,3 +87,13 @@ def test_the_wide_gap_is_identified_within_two_per_cent(seed, tmp_path):
     found = identifying.identify(profile, machine, seed, None, 20.0, tmp_path / "run", TICK_S)
     assert found.stiffness_share < 0.02
     assert found.width_share < 0.02
+
+
+@pytest.mark.parametrize("share", [TOUCH_SHARE, IDENTIFY_SHARE])
+def test_a_slow_filter_is_given_time_on_each_side(share):
+    """A side counts once the joint has been pressed there for as long as the filter remembers, and it lags as well."""
+    slow = OLED._replace(hold_s=0.56)
+    sweep = touch_sweep.plan(slow, share, IDENTIFY_HZ, TOUCH_S)
+    assert pressed_s(slow, sweep) == pytest.approx(2.25 * 0.56, rel=1e-3)
+    assert sweep.duration_s * sweep.frequency_hz == pytest.approx(5.0)
+    assert touch_sweep.plan(OLED._replace(hold_s=0.105), share, IDENTIFY_HZ, TOUCH_S).frequency_hz == IDENTIFY_HZ
