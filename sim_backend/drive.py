@@ -115,6 +115,12 @@ class Drive:
         self._apply_torque_limit()
         self._set_state(DriveState.SWITCH_ON_DISABLED)
 
+    def boot(self) -> None:
+        """Come up after its supply was gone: an incremental encoder begins to count anew where it stands."""
+        self._origin_count = int(self.servo["encoder_count"][0])
+        self._homed = self._homing_error = False
+        self.power_up()
+
     # -- objects ------------------------------------------------------------------------------------------------------
 
     def write_error(self, object_key: int, value: int) -> int:

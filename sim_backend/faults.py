@@ -9,8 +9,17 @@ from typing import Any
 
 from stagectl.errors import ProfileError
 
-BUS_KINDS = ("drop_frame", "delay_frame", "duplicate_frame", "short_frame", "bus_off")
-DRIVE_KINDS = ("emergency", "heartbeat_silence", "input", "stuck_statusword")
+BUS_KINDS = ("drop_frame", "delay_frame", "duplicate_frame", "short_frame", "corrupt_frame", "bus_off")
+DRIVE_KINDS = (
+    "emergency",
+    "heartbeat_silence",
+    "input",
+    "stuck_statusword",
+    "power_loss",  # it is dark as long as this lasts, then boots
+    "object_change",  # somebody else writes an object
+    "encoder_jump",
+    "flood",  # it talks without end
+)
 SENSOR_KINDS = (
     "beam_loss",
     "stuck_counts",
@@ -20,22 +29,32 @@ SENSOR_KINDS = (
     "sensor_restart",
     "sensor_silence",
     "unplug",
+    "clock_drift",
 )
-KINDS = BUS_KINDS + DRIVE_KINDS + SENSOR_KINDS
+MACHINE_KINDS = ("edge_jump", "obstacle")
+KINDS = BUS_KINDS + DRIVE_KINDS + SENSOR_KINDS + MACHINE_KINDS
 
 _NEEDS = {
     "drop_frame": ("can_id",),
     "delay_frame": ("can_id", "delay_s"),
     "duplicate_frame": ("can_id",),
     "short_frame": ("can_id", "length_count"),
+    "corrupt_frame": ("can_id", "bits"),
     "emergency": ("node_id", "code"),
     "heartbeat_silence": ("node_id",),
     "input": ("node_id", "bits"),
     "stuck_statusword": ("node_id",),
+    "power_loss": ("node_id",),
+    "object_change": ("node_id", "index", "subindex", "value"),
+    "encoder_jump": ("node_id", "offset_m"),
+    "flood": ("node_id", "can_id", "count"),
     "beam_loss": ("axis",),
     "garbage": ("count",),
     "half_line": ("length_count",),
     "sequence_gap": ("count",),
+    "clock_drift": ("ppm",),
+    "edge_jump": ("offset_m",),
+    "obstacle": ("offset_m",),
 }
 _FOREVER_S = 1e9
 
@@ -53,7 +72,12 @@ class Fault:
     delay_s: float | None = None
     length_count: int | None = None  # bytes that are left
     code: int | None = None
-    bits: int | None = None  # of 0x60FD
+    bits: int | None = None  # of 0x60FD, or those of a payload (little-endian) that turn over
+    index: int | None = None  # of an object
+    subindex: int | None = None
+    value: int | None = None
+    offset_m: float | None = None  # of encoder or right edge; of an obstacle, from where the macro is
+    ppm: float | None = None
     axis: str | None = None  # macro | end | both
 
 
@@ -158,4 +182,12 @@ class WireFaults:
                 copies = copies + copies
             elif fault.kind == "short_frame":
                 copies = [(delay_ns, data[: fault.length_count]) for delay_ns, data in copies]
+            elif fault.kind == "corrupt_frame":
+                copies = [(delay_ns, _turned_over(data, fault.bits or 0)) for delay_ns, data in copies]
         return copies
+
+
+def _turned_over(payload: bytes, bits: int) -> bytes:
+    """Invert bits of a payload, the first byte's lowest first."""
+    mask = (1 << 8 * len(payload)) - 1
+    return ((int.from_bytes(payload, "little") ^ bits) & mask).to_bytes(len(payload), "little")

@@ -30,6 +30,7 @@ class Interferometer:
         self.next_line_length: int | None = None  # cut the next line to this many bytes
         self._start_t_ns = start_t_ns
         self._period_ns = 1e9 / sensor.rate_hz / (1.0 + 1e-6 * sensor.clock_ppm)  # a fast clock has short periods
+        self._own_period_ns = self._period_ns
         self._counts_per_m = sensor.counts_per_wavelength * air.index_of(machine.air) / machine.air.wavelength_vacuum_m
         self._noise_m = sensor.noise_m
         self._speed_limit_m_per_s = sensor.interpolation_speed_m_per_s
@@ -38,13 +39,17 @@ class Interferometer:
         self._transport = Transport(sensor, np.random.default_rng([seed, 2]))
         self._writer = writer_for(sensor, machine.air, 2 if machine.micro is not None else 1)
         self._number = 0  # samples taken; the sequence number may jump or restart
+        self._start_number = 0  # of the sample at `_start_t_ns`
         self.next_sample_t_ns = start_t_ns
         self.next_arrival_t_ns = self._transport.arrival_t_ns(start_t_ns)  # of the next sample's line
         self._sample = Sample(0, 0.0, 0.0, False, False, True, True)
 
     def sample_t_ns(self, number: int) -> int:
-        """Return the instant of the sample of that number (0 = the first, at the start), host clock."""
-        return self._start_t_ns + round(number * self._period_ns)
+        """Return the instant of the sample of that number (0 = the first, at the start), host clock.
+
+        Of past samples only while the clock does not drift.
+        """
+        return self._start_t_ns + round((number - self._start_number) * self._period_ns)
 
     def sample(
         self, macro_m: float, end_m: float, macro_m_per_s: float, end_m_per_s: float
@@ -92,6 +97,11 @@ class Interferometer:
             self.macro_zero_m = macro_m - self._sample.macro_counts / self._counts_per_m
         if self.lost_axes & END_BIT:
             self.end_zero_m = end_m - self._sample.end_counts / self._counts_per_m
+
+    def drift(self, ppm: float) -> None:
+        """Let the clock run faster than its own by `ppm` from the next sample on; 0 ends that."""
+        self._start_t_ns, self._start_number = self.next_sample_t_ns, self._number
+        self._period_ns = self._own_period_ns / (1.0 + 1e-6 * ppm)
 
     def restart(self, macro_m: float, end_m: float) -> None:
         """Power-cycle the device: sequence and counts begin at zero again."""

@@ -110,6 +110,7 @@ class DriveNode:
         self.objects = object_dictionary.numbers(dictionary)
         self.drive = make_drive(self.objects)
         self.heartbeat_is_silent = False  # fault injection
+        self.is_dark = False  # without supply
         self._wire = _NodeWire()
         self._wire.t_ns = t_ns
         self._dictionary = dictionary
@@ -147,6 +148,39 @@ class DriveNode:
         if application:
             self.drive.power_up()
         self._start()
+
+    def lose_power(self, t_ns: int) -> list[tuple[int, bytes]]:
+        """Go dark at once: no torque, no frame; the supply of a node is its own, the motor's goes with it."""
+        self._wire.t_ns = t_ns
+        self._local.nmt.stop_heartbeat()
+        self.drive.power_up()
+        self.drive.emergencies.clear()
+        self._wire.outbox.clear()
+        self.nmt_state = NMT_INITIALISING
+        self.is_dark = True
+        return []
+
+    def boot(self, t_ns: int) -> list[tuple[int, bytes]]:
+        """Come back with the defaults of every object, and an encoder that counts from where it stands."""
+        self._wire.t_ns = t_ns
+        self.is_dark = False
+        self.objects.update(self._defaults)
+        self._local.data_store.clear()
+        self.drive.boot()
+        self._start()
+        return self._take()
+
+    def change_object(self, index: int, subindex: int, value: int) -> None:
+        """Put a value into an object as another master's tool would; it is checked by nobody."""
+        self.objects[key(index, subindex)] = value
+        variable = self._dictionary.get_variable(index, subindex)
+        if variable is not None:  # what an SDO upload gives
+            data = (value & (1 << len(variable)) - 1).to_bytes(len(variable) // 8, "little")
+            self._local.data_store.setdefault(index, {})[subindex] = data
+        if index in _PDO_INDICES:
+            self._read_pdos()
+        else:
+            self.drive.written(key(index, subindex))
 
     # -- SDO ----------------------------------------------------------------------------------------------------------
 
@@ -192,6 +226,8 @@ class DriveNode:
 
     def on_frame(self, can_id: int, payload: bytes, t_ns: int) -> list[tuple[int, bytes]]:
         """Take a frame (SYNC has `on_sync`), return the frames that the node answers with at once."""
+        if self.is_dark:
+            return []
         self._wire.t_ns = t_ns
         pdo = self._rpdo_of.get(can_id)
         if pdo is not None:
@@ -298,6 +334,8 @@ class DriveNode:
 
     def next_t_ns(self) -> int:
         """Return when `on_time` wants to be called next."""
+        if self.is_dark:
+            return _NEVER_NS
         due = min(self._heartbeat_t_ns, self._rpdo_t_ns, self._sync_t_ns, self._watch_t_ns)
         for task in self._wire.periodic:
             if task.due_t_ns < due:
@@ -400,4 +438,4 @@ class DriveNode:
     def _take(self) -> list[tuple[int, bytes]]:
         frames = self._wire.outbox
         self._wire.outbox = []
-        return frames
+        return [] if self.is_dark else frames

@@ -174,6 +174,7 @@ class RigProcess:
             "drives": {str(node.node_id): node.drive.state.name for node in rig.nodes},
             "lines_lost_count": self.port.lines_lost_count,
             "held_up_ns": self._held_up_ns,
+            "syncs_count": rig.syncs_count,
         }
 
     def close(self) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from sim_backend import drive_servo, object_dictionary
 from sim_backend.drive import Drive
-from sim_backend.faults import BUS_KINDS, Fault, FaultSchedule, WireFaults
+from sim_backend.faults import BUS_KINDS, MACHINE_KINDS, Fault, FaultSchedule, WireFaults
 from sim_backend.interferometer import END_BIT, MACRO_BIT, Interferometer
 from sim_backend.node import DriveNode
 from sim_backend.truth import TruthLog
@@ -78,6 +78,7 @@ class Rig:
         self.truth = TruthLog(rows_count)
         self.wire_faults = WireFaults()
         self.is_unplugged = False  # the sensor's port is gone
+        self.syncs_count = 0
         self._effects = [dict(effect) for effect in machine.effects]
         self._plant_parameters = plant.parameters(machine, seed)
         self._effect_parameters = compose.effect_parameters(self._effects)
@@ -224,6 +225,7 @@ class Rig:
             self._run_events(t_ns)
         answers: list[tuple[int, bytes]] = []
         if sync:
+            self.syncs_count += 1
             for node, motor in zip(self.nodes, self._motors(), strict=False):
                 answers += node.on_sync(t_ns, *motor)
             self._plan()
@@ -320,10 +322,26 @@ class Rig:
                 for node in self.nodes:
                     node.lose_bus(t_ns)
             return
+        if fault.kind in MACHINE_KINDS:
+            self._change_machine(begins, fault)
+            return
         for node in self.nodes:
             if node.node_id == fault.node_id:
                 self._change_drive_fault(begins, fault, node, t_ns)
         self._change_sensor_fault(begins, fault)
+
+    def _change_machine(self, begins: bool, fault: Fault) -> None:
+        """Wear or move what the machine is made of."""
+        parameters, offset_m = self._plant_parameters, fault.offset_m or 0.0
+        if fault.kind == "edge_jump":
+            if begins:
+                parameters["right_m"] += offset_m
+            return
+        side = "travel_high_m" if offset_m > 0.0 else "travel_low_m"
+        if begins:
+            parameters[side] = self.plant_state()["macro_position_m"] + offset_m
+        else:
+            parameters[side] = plant.parameters(self.machine, 0)[side]
 
     def _change_drive_fault(self, begins: bool, fault: Fault, node: DriveNode, t_ns: int) -> None:
         if fault.kind == "heartbeat_silence":
@@ -339,6 +357,15 @@ class Rig:
                 self._stuck_statuswords[node.node_id] = b""
             else:
                 self._stuck_statuswords.pop(node.node_id, None)
+        elif fault.kind == "power_loss":
+            self._collect(t_ns, node.lose_power(t_ns) if begins else node.boot(t_ns))
+        elif fault.kind == "object_change" and begins:
+            node.change_object(fault.index or 0, fault.subindex or 0, fault.value or 0)
+        elif fault.kind == "encoder_jump":
+            offset_m = fault.offset_m or 0.0
+            node.drive.servo_parameters["encoder_offset_m"] += offset_m if begins else -offset_m
+        elif fault.kind == "flood" and begins:
+            self._collect(t_ns, [(fault.can_id or 0, bytes(8))] * (fault.count or 0))
 
     def _change_sensor_fault(self, begins: bool, fault: Fault) -> None:
         interferometer = self.interferometer
@@ -353,6 +380,8 @@ class Rig:
         elif kind == "unplug":
             self.is_unplugged = begins
             self._lines.clear()
+        elif kind == "clock_drift":
+            interferometer.drift((fault.ppm or 0.0) if begins else 0.0)
         elif begins:
             self._disturb_once(fault)
 
