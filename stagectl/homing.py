@@ -98,15 +98,29 @@ class Homing(StreamMotion):
         return _INDEX_METHODS[1] if float(self.status()["macro_encoder_m"]) < 0.0 else _INDEX_METHODS[0]
 
     def _home_drive(self) -> Stop:
-        """Let the macro's drive find its index."""
+        """Let the macro's drive find its index; where there is none on the one side, on the other.
+
+        A stage that was connected anew does not know on which side of the index it stands.
+        """
         if not self.backend.may_move:  # before anything is written to a drive
             raise RequestError(WATCHED_ONLY)
+        method = self._homing_method()
+        stop = self._search(method)
+        if stop is not Stop.DRIVE_FAULT or method not in _INDEX_METHODS or self._failed(self.status()):
+            return stop
+        other = _INDEX_METHODS[1 - _INDEX_METHODS.index(method)]
+        self._event("homing_turned", method=method, other=other, text=self.detail)
+        return self.acknowledge() or self._search(other)
+
+    def _search(self, method: int) -> Stop:
+        """Let the macro's drive home by a method of CiA 402."""
         homing, node = self.profile.macro.homing, self.profile.macro.node_id
         step_m = self.profile.macro.encoder_step_m
         self.disarm()
+        self._demand_agreed()
         master = self.master
         master.write(node, cia402.MODES_OF_OPERATION, 0, cia402.MODE_HOMING)
-        master.write(node, cia402.HOMING_METHOD, 0, self._homing_method())
+        master.write(node, cia402.HOMING_METHOD, 0, method)
         master.write(node, cia402.HOMING_SPEEDS, 1, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_SPEEDS, 2, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_ACCELERATION, 0, round(homing.acceleration_m_per_s2 / step_m))

@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from drivers import cia402
+from drivers.agreed import Agreed, changed, read_agreed
 from drivers.arming import DriveMapping, DriveSettings, configure
 from drivers.canopen_master import Master
 from stagectl.backend import Backend, ServoLink
@@ -82,6 +83,7 @@ class Session:
         self._reason = ""  # why this side asked the servo to stop
         self._trouble: StagectlError | None = None  # raised as soon as the stage rests
         self.mappings: dict[str, DriveMapping] = {}
+        self._agreed: dict[int, Agreed] = {}
         self.remarks: list[str] = []
         """What the operator should know of this arming, in words."""
 
@@ -222,6 +224,7 @@ class Session:
         settings = drive_settings(self.profile, backend.vendor_id)
         found = configure(master, list(settings.values()), self._remark)
         self.mappings = dict(zip(settings, found, strict=True))
+        self._agreed = {drive.node_id: read_agreed(master, drive) for drive in settings.values()}
         # What a drive was capped to is what laws, guard, plans and replay go by from here on.
         profile = self.profile = self.profile.with_force_limits(self._force_limits_n(settings))
         manifest = {
@@ -252,6 +255,17 @@ class Session:
         """Keep what the operator should know, and say it at once."""
         self.remarks.append(text)
         self._progress(text, 0.0)
+
+    def drives_changed(self) -> str:
+        """Say which drive is not configured any more as it was; empty where all are. Errors: LinkError, DriveError."""
+        found = (changed(self.master, node_id, agreed) for node_id, agreed in self._agreed.items())
+        return next((text for text in found if text), "")
+
+    def _demand_agreed(self) -> None:
+        """Give no drive power that is not what it was configured to be. Errors: LinkError, DriveError."""
+        text = self.drives_changed()
+        if text:
+            raise DriveError(f"{text}; connect the stage anew")
 
     def _force_limits_n(self, settings: dict[AxisName, DriveSettings]) -> dict[AxisName, float]:
         """Return the limits of the drives that arming capped below what the profile asked for."""
@@ -320,6 +334,7 @@ class Session:
             raise RequestError(WATCHED_ONLY)
         if self._asked_to_stop:
             return Stop.OPERATOR
+        self._demand_agreed()  # a drive that restarted sends no heartbeat for good: that says more
         if self._heartbeats.missing:
             return Stop.HEARTBEAT_LOST
         self._holds_lease = True

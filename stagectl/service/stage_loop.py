@@ -21,6 +21,7 @@ from stagectl.service.view import BANNERS, backlash_message
 from stagectl.session import WATCHED_ONLY
 from stagectl.signals import Stop
 from stagectl.stage import choose
+from stagectl.supervisor import Supervisor
 from stagectl.wear import IDENTIFIED, PROBE
 
 
@@ -169,6 +170,18 @@ class StageLoop(StageWatch):
         self._memory.keep(backlash=found)
         return found
 
+    def _needs_anew(self, stage: Supervisor) -> bool:
+        """Tell whether the world must be opened anew: the servo gave a link up, or a drive forgot its configuration."""
+        if Stop(int(stage.status()["stop"])) in faults.NEEDS_NEW_SERVO:
+            return True
+        try:
+            text = stage.drives_changed()
+        except StagectlError as error:  # it does not even answer
+            text = str(error)
+        if text:
+            self._log.say("drives_changed", text)
+        return bool(text)
+
     def _do_acknowledge(self, order: Order) -> None:
         if self._fault is None or self._state is not State.FAULT:
             raise RequestError(f"there is no fault to acknowledge; the state is {self._state}")
@@ -177,8 +190,7 @@ class StageLoop(StageWatch):
                 f"fault {order.body.number} is not the newest; look at fault {self._fault.number} and acknowledge that"
             )
         stage = self._stage
-        renew = stage is not None and Stop(int(stage.status()["stop"])) in faults.NEEDS_NEW_SERVO
-        if stage is None or renew:
+        if stage is None or self._needs_anew(stage):
             self._close_stage()
             self._enter(Event.LET_GO, "acknowledged")
             self._retry_at_s = 0.0
