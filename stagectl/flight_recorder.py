@@ -151,7 +151,8 @@ class FlightRecorder:
             return
         with self._policy():
             folder = self._reserve(name)
-            self._run = Recorder(folder, {**self._manifest, "trigger": trigger, "start_t_ns": t_ns})
+            begun = {**self._manifest, "trigger": trigger, "start_t_ns": t_ns}
+            self._run = Recorder(folder, begun, durable=True)
             self._run.event("begin", t_ns, trigger=trigger)
             self._lead_to(folder)
             self.trigger, self.trouble = trigger, ""

@@ -18,6 +18,7 @@ import numpy as np
 import structlog
 
 from stagectl.errors import RecordError
+from stagectl.onto_disk import OntoDisk
 from stagectl.ring import RingReader, writer_alive
 from stagectl.row import ROW, layout_hash
 from stagectl.samples_file import (
@@ -47,6 +48,9 @@ FORMAT = 1
 
 RESERVE_BYTES = 2 << 20
 """Kept free for the end of a run: about 1 s of rows (1.2 MB at 1 kHz) and the manifest still fit on a full disk."""
+
+DURABLE_BATCH_NS = 100_000_000
+"""Rows of a durable run wait so long for their batch; the disk has the rest of 0.25 s."""
 
 _RESERVE = ".reserve"
 
@@ -111,8 +115,11 @@ class Recorder:
     rows until the stage stands, and the manifest, still fit.
     """
 
-    def __init__(self, folder: Path, manifest: dict, fields: Sequence[str] | None = None):
-        """Make the folder and write the manifest; `fields` limits the recorded ROW fields (imported tables)."""
+    def __init__(self, folder: Path, manifest: dict, fields: Sequence[str] | None = None, *, durable: bool = False):
+        """Make the folder and write the manifest; `fields` limits the recorded ROW fields (imported tables).
+
+        `durable`: when the power goes, the disk has all but the last 0.25 s.
+        """
         self.folder = Path(folder)
         self.manifest = dict(manifest)
         self.rows_count = 0
@@ -123,6 +130,8 @@ class Recorder:
         self._last_t_ns: int | None = None
         self._marks: deque[tuple[int, int | None]] = deque([(0, None)])  # (rows, cycle) at the end of each piece
         self._closed = False
+        self._onto_disk: OntoDisk | None = None
+        self._batch_ns = DURABLE_BATCH_NS if durable else BATCH_NS
         for name in (MANIFEST, SAMPLES, EVENTS):
             if (self.folder / name).exists():
                 raise RecordError(f"{self.folder}: already holds a run ({name}); give the run another folder")
@@ -146,6 +155,8 @@ class Recorder:
                 "free space, check permissions, or give another folder"
             ) from error
         self._log = _structured_log(self._put_event)
+        if durable:
+            self._onto_disk = OntoDisk((self._samples, self._events))
 
     @property
     def recovery_folder(self) -> Path:
@@ -174,7 +185,7 @@ class Recorder:
         self._pending_count = end
         self.rows_count += count
         span_ns = self._last_t_ns - int(self._pending["t_ns"][0])
-        if not 0 <= span_ns < BATCH_NS or end >= BATCH_ROWS_COUNT:
+        if not 0 <= span_ns < self._batch_ns or end >= BATCH_ROWS_COUNT:
             self.flush()
 
     def flush(self) -> None:
@@ -228,6 +239,8 @@ class Recorder:
     def abandon(self) -> None:
         """Let go of the files as they are: whole up to the last batch, and not marked as ended."""
         self._closed = True
+        if self._onto_disk is not None:
+            self._onto_disk.close()
         try:
             self._samples.close()
         finally:
@@ -241,11 +254,16 @@ class Recorder:
 
     def _put_event(self, line: bytes) -> None:
         self._events.hold([line])
-        self._write(self._events.write_held)
+        self._write(self._write_events)
+
+    def _write_events(self) -> None:
+        self._events.write_held()
+        if self._onto_disk is not None:
+            self._onto_disk.hurry()
 
     def _write_held(self) -> None:
         self._samples.write_held()
-        self._events.write_held()
+        self._write_events()
 
     def _write_manifest(self) -> None:
         replace_whole(self.folder / MANIFEST, _encoded(_to_json(self.manifest, indent=2)))

@@ -60,6 +60,10 @@ class WholeFile:
             raise
         self.size_bytes += written
 
+    def put_onto_disk(self) -> None:
+        """Wait until the disk itself has what was written. Errors: OSError."""
+        os.fdatasync(self._descriptor)
+
     def close(self) -> None:
         """Put the file on the disk itself and let go of it, whatever is still held."""
         if self._descriptor < 0:

@@ -44,7 +44,7 @@ class Recording:
 
         def make(folder: Path, manifest: dict[str, Any]) -> Recorder | FlightRecorder:
             if profile.record.when == "always":
-                self._recorder = Recorder(folder, {**manifest, "kept_by": "service"})
+                self._recorder = Recorder(folder, {**manifest, "kept_by": "service"}, durable=True)
             else:
                 self._recorder = FlightRecorder(
                     folder,
