@@ -49,8 +49,8 @@ _GUIDED_STOPS = (
 )
 """Stops after which sensor and law can be trusted with the micro until the macro is slow, where its drive can."""
 
-_FULL_RAMP_STOPS = (Stop.LEASE, Stop.SUPERVISOR_SILENT)
-"""Nobody is left who knows where the stage may go: stop as short as the drive would."""
+_GENTLE_STOPS = (Stop.OPERATOR,)
+"""Nothing is wrong: half the ramp is enough. After all others the stage stops as short as the drive would."""
 
 _UNPOWERED_STOPS = (Stop.OPERATOR, Stop.FINISHED)
 """After these the power goes; after all others the drives hold what they hold until somebody acknowledges."""
@@ -596,11 +596,11 @@ class Servo:
         hold["acceleration_m_per_s2"] = model["macro_acceleration_m_per_s2"]
 
     def _slow_down(self, passed: int) -> None:
-        """Bring the reference to rest at half the drive's own stopping deceleration."""
+        """Bring the reference to rest at the drive's own stopping deceleration, half of it where an operator asked."""
         hold = self.tracker.hold
         dt_s = passed * self._period_s
         v = float(hold["velocity_m_per_s"][0])
-        share = 1.0 if self.stop in _FULL_RAMP_STOPS else 0.5
+        share = 0.5 if self.stop in _GENTLE_STOPS else 1.0
         step = share * self._stop_deceleration * dt_s
         after = v - step if v > step else v + step if v < -step else 0.0
         hold["position_m"] += 0.5 * (v + after) * dt_s
