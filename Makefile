@@ -47,6 +47,7 @@ bench: setup
 	$(BIN)/python -m bench main_job --markdown docs/figures.md
 	$(BIN)/python -m bench gap --markdown docs/figures-gap.md
 	$(BIN)/python -m bench paper --markdown docs/figures-paper.md
+	$(BIN)/python -m bench service --markdown docs/figures-service.md
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -10,11 +10,12 @@ import os
 import sys
 import time
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 from bench.figure import Figure
 
-NAMES = ("gap", "main_job", "paper")
+NAMES = ("gap", "main_job", "paper", "service")
 
 
 def _arguments(argv: list[str] | None) -> argparse.Namespace:
@@ -24,6 +25,8 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--full", action="store_true", help="more seeds and longer runs")
     parser.add_argument("--out", type=Path, help="write what is printed to this file as well")
     parser.add_argument("--markdown", type=Path, help="write the table with date and host load to this file")
+    parser.add_argument("--seed", type=int, help="service: play one run of the batch campaign again")
+    parser.add_argument("--part", help="service: do only this part")
     return parser.parse_args(argv)
 
 
@@ -73,7 +76,9 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _arguments(argv)
     begin_s, load = time.monotonic(), _load()
     module = importlib.import_module(f"bench.{arguments.name}")
-    figures = list(module.figures(full=arguments.full, say=lambda text: print(text, file=sys.stderr, flush=True)))
+    chosen = {name: value for name in ("seed", "part") if (value := getattr(arguments, name)) is not None}
+    say = partial(print, file=sys.stderr, flush=True)
+    figures = list(module.figures(full=arguments.full, say=say, **chosen))
     load = f"Load average of the host (1 / 5 / 15 min): {load} before, {_load()} after."
     if arguments.json:
         text = "\n".join(json.dumps(figure.as_json()) for figure in figures)

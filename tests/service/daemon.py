@@ -28,31 +28,35 @@ PATIENT = {  # limits that a busy test host does not pass
 class Daemon:
     """A service of its own, with everything that it leaves below one folder."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, changes: dict = PATIENT, runs: Path | None = None):
         self.folder = folder
         (folder / "tmp").mkdir(parents=True)
-        profile = folder / "patient.toml"
-        profile.write_text(changed(PROFILES_FOLDER / "single-axis.toml", PATIENT))
+        self.profile = folder / "patient.toml"
+        self.profile.write_text(changed(PROFILES_FOLDER / "single-axis.toml", changes))
         self.socket = folder / "stage.socket"
         self.state = folder / "state"
-        self.runs = folder / "runs"
-        command = [sys.executable, "-m", "stagectl.cli", "serve", str(profile), "--backend", "rig", "--tcp", "0"]
-        command += ["--socket", str(self.socket), "--state", str(self.state), "--runs", str(self.runs)]
+        self.runs = folder / "runs" if runs is None else runs
         self.notes = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self.notes.bind(str(folder / "notify"))
         self.err = open(folder / "err", "w+")  # noqa: SIM115
+        self.start()
+        self.client = Client(self.socket)
+
+    def start(self):
+        """Start the service, as systemd does, and does again."""
+        command = [sys.executable, "-m", "stagectl.cli", "serve", str(self.profile), "--backend", "rig", "--tcp", "0"]
+        command += ["--socket", str(self.socket), "--state", str(self.state), "--runs", str(self.runs)]
         self.process = subprocess.Popen(
             command,
             stderr=self.err,
             stdout=subprocess.DEVNULL,
             env={
                 **os.environ,
-                "TMPDIR": str(folder / "tmp"),
-                "NOTIFY_SOCKET": str(folder / "notify"),
+                "TMPDIR": str(self.folder / "tmp"),
+                "NOTIFY_SOCKET": str(self.folder / "notify"),
                 "WATCHDOG_USEC": "1000000",
             },
         )
-        self.client = Client(self.socket)
 
     def until(self, done, what):
         """Ask again and again; fails after a while."""

@@ -1,0 +1,245 @@
+"""Mutants of one module: every small change of its code that a test should notice, each run in a process of its own.
+
+Code runs uncompiled: `stagectl.compiled` is replaced, so that a mutant costs no compiler. A mutant is killed when a
+test fails, or takes longer than it may.
+"""
+
+import ast
+import copy
+import os
+import signal
+import sys
+import time
+import types
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_ROOT = Path(__file__).resolve().parent.parent
+_COMPARED: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
+    ast.Lt: (ast.LtE, ast.Gt),
+    ast.LtE: (ast.Lt, ast.Gt),
+    ast.Gt: (ast.GtE, ast.Lt),
+    ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,),
+    ast.NotEq: (ast.Eq,),
+    ast.Is: (ast.IsNot,),
+    ast.IsNot: (ast.Is,),
+}
+_COMPUTED: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+    ast.LShift: ast.RShift,
+}
+_CALLED = {"min": "max", "max": "min"}
+_DELETED = (ast.Assign, ast.AugAssign, ast.Raise, ast.Return)
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change: where, and what became of what."""
+
+    function: str
+    line: int
+    change: str
+    tree: ast.Module
+    """Of the module, shared by all its mutants; unchanged but between `apply` and `revert`."""
+    node: Any
+    field: Any
+    kept: Any
+    replacement: Any
+
+    def apply(self) -> ast.Module:
+        """Make the change."""
+        _put(self.node, self.field, self.replacement)
+        return self.tree
+
+    def revert(self) -> None:
+        """Take it back."""
+        _put(self.node, self.field, self.kept)
+
+    @property
+    def key(self) -> str:
+        """What names it in a list, whatever lines are added elsewhere."""
+        return f"{self.function}: {self.change}"
+
+
+def mutants(source: str) -> list[Mutant]:
+    """Return every mutant of a module's functions and constants; texts and annotations stay as they are."""
+    tree = ast.parse(source)
+    found: list[Mutant] = []
+    counted: dict[str, int] = {}
+    for function, node, field, replacement, change in _places(tree):
+        kept = getattr(node, field) if isinstance(field, str) else getattr(node, field[0])[field[1]]
+        number = counted[f"{function}{change}"] = counted.get(f"{function}{change}", 0) + 1
+        said = change if number == 1 else f"{change} (#{number})"
+        line = getattr(kept, "lineno", 0)
+        found.append(Mutant(function, line, said, tree, node, field, kept, replacement))
+    return found
+
+
+def _put(node: Any, field: Any, value: Any) -> None:
+    if isinstance(field, str):
+        setattr(node, field, value)
+    else:
+        getattr(node, field[0])[field[1]] = value
+
+
+def _places(tree: ast.Module) -> Iterator[tuple[str, Any, Any, Any, str]]:
+    """Yield (function, node, field, replacement, change in words) for every place that can be changed."""
+    for name, top in _scopes(tree):
+        for parent in ast.walk(top):
+            for field, value in ast.iter_fields(parent):
+                if field in ("annotation", "returns", "decorator_list"):
+                    continue
+                if isinstance(value, list):
+                    for k, item in enumerate(value):
+                        if isinstance(item, ast.AST):
+                            for replacement, change in _changes(item, parent):
+                                yield name, parent, (field, k), replacement, change
+                elif isinstance(value, ast.AST):
+                    for replacement, change in _changes(value, parent):
+                        yield name, parent, field, replacement, change
+
+
+def _scopes(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef):
+            yield node.name, ast.Module(node.body, [])
+        elif isinstance(node, ast.ClassDef):
+            for inner in node.body:
+                if isinstance(inner, ast.FunctionDef):
+                    yield f"{node.name}.{inner.name}", ast.Module(inner.body, [])
+        elif isinstance(node, ast.Assign) and not isinstance(node.value, ast.Call):
+            yield "module", node
+
+
+def _changes(node: ast.AST, parent: ast.AST) -> Iterator[tuple[ast.AST, str]]:
+    """Yield what a node may become."""
+    if isinstance(parent, ast.JoinedStr | ast.FormattedValue) or isinstance(node, ast.JoinedStr):
+        return
+    place = (
+        f"in {_said(parent)}: " if isinstance(node, ast.Constant) and isinstance(parent, ast.expr | ast.stmt) else ""
+    )
+    for new in _new_nodes(node):
+        ast.copy_location(new, node)
+        ast.fix_missing_locations(new)
+        yield new, f"{place}{_said(node)} -> {_said(new)}"
+    if isinstance(node, ast.stmt) and isinstance(node, _DELETED):
+        yield ast.copy_location(ast.Pass(), node), f"{_said(node)} -> nothing"
+
+
+def _said(node: ast.AST) -> str:
+    """Return the code of an expression, the first line of a statement."""
+    return ast.unparse(node).splitlines()[0] if isinstance(node, ast.expr | ast.stmt) else ""
+
+
+def _new_nodes(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
+    if isinstance(node, ast.Compare):
+        for k, operator in enumerate(node.ops):
+            for other in _COMPARED.get(type(operator), ()):
+                changed = copy.deepcopy(node)
+                changed.ops[k] = other()
+                yield changed
+    elif isinstance(node, ast.BoolOp):
+        yield ast.BoolOp(ast.Or() if isinstance(node.op, ast.And) else ast.And(), copy.deepcopy(node.values))
+        for k in range(len(node.values)):
+            kept = [copy.deepcopy(value) for n, value in enumerate(node.values) if n != k]
+            yield kept[0] if len(kept) == 1 else ast.BoolOp(copy.deepcopy(node.op), kept)
+    elif isinstance(node, ast.BinOp) and type(node.op) in _COMPUTED:
+        yield ast.BinOp(copy.deepcopy(node.left), _COMPUTED[type(node.op)](), copy.deepcopy(node.right))
+    elif isinstance(node, ast.AugAssign) and type(node.op) in _COMPUTED:
+        yield ast.AugAssign(copy.deepcopy(node.target), _COMPUTED[type(node.op)](), copy.deepcopy(node.value))
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.USub):
+        yield copy.deepcopy(node.operand)
+    elif isinstance(node, ast.Constant):
+        if isinstance(node.value, bool):
+            yield ast.Constant(not node.value)
+        elif isinstance(node.value, int | float):
+            yield ast.Constant(node.value + 1)
+    elif isinstance(node, ast.IfExp):
+        yield copy.deepcopy(node.body)
+        yield copy.deepcopy(node.orelse)
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        if node.func.id in _CALLED:
+            yield ast.Call(ast.Name(_CALLED[node.func.id], ast.Load()), copy.deepcopy(node.args), [])
+        elif node.func.id == "abs":
+            yield copy.deepcopy(node.args[0])
+    elif isinstance(node, ast.If):
+        for value in (True, False):
+            yield ast.If(ast.Constant(value), copy.deepcopy(node.body), copy.deepcopy(node.orelse))
+
+
+# ---- running ---------------------------------------------------------------------------------------------------------
+
+
+class _Fields:
+    """A row of a structured array with its fields as attributes, as compiled code has them."""
+
+    def __init__(self, row: Any) -> None:
+        object.__setattr__(self, "row", row)
+
+    def __getattr__(self, name: str) -> Any:
+        return self.row[name].item()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        self.row[name] = value
+
+
+def uncompiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Run as Python what is written to be compiled."""
+
+    def call(*arguments: Any) -> Any:
+        return function(*(_Fields(one) if isinstance(one, np.void) else one for one in arguments))
+
+    return call
+
+
+def survives(module: str, make: Callable[[], ast.Module], tests: list[str], timeout_s: float) -> bool:
+    """Run the tests against what `make` returns, in a forked process; tell whether all of them pass."""
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            code = _run(module, make(), tests)
+        finally:
+            os._exit(code)
+    until_s = time.monotonic() + timeout_s
+    while True:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status) == 0
+        if time.monotonic() > until_s:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            return False
+        time.sleep(0.01)
+
+
+def _run(name: str, tree: ast.Module, tests: list[str]) -> int:
+    """Put the mutant where the module was, and run the tests, which import it anew."""
+    import pytest
+
+    from stagectl import compiled as compiler
+
+    out = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(out, 1)
+    os.dup2(out, 2)
+    compiler.compiled = uncompiled  # type: ignore[assignment]
+    module = types.ModuleType(name)
+    module.__file__ = str(_ROOT / (name.replace(".", "/") + ".py"))
+    sys.modules[name] = module
+    exec(compile(ast.fix_missing_locations(tree), module.__file__, "exec"), module.__dict__)
+    package, _, last = name.rpartition(".")
+    setattr(sys.modules[package], last, module)
+    for path in tests:
+        sys.modules.pop(path.removesuffix(".py").replace("/", "."), None)
+    known = "ignore::pytest.PytestAssertRewriteWarning"  # libraries that the first process has imported
+    return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-W", known, *tests]))

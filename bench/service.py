@@ -1,0 +1,36 @@
+"""The service under faults: seeded runs on the rig in virtual time, and mutation tests of guard and lease.
+
+`--seed N` plays one run of the batch campaign and says what was seen; `--part NAME` does one part. Without `--full`
+the parts take 15 minutes together; with it, an interrupted campaign goes on where its journal ends.
+"""
+
+from collections.abc import Callable, Iterator
+
+from bench import service_batch, service_mutants
+from bench.figure import Figure
+
+ABOUT = (
+    "Faults are injected in the rig, over the wire; judges read the rig's own log (`tests/faults/judge.py`). "
+    "A run is drawn from its seed: `python -m bench service --seed N` plays it again."
+)
+
+Say = Callable[[str], None]
+
+PARTS: dict[str, Callable[..., Iterator[Figure]]] = {
+    "batch": service_batch.figures,
+    "mutants": service_mutants.figures,
+}
+"""By the name that `--part` takes."""
+
+
+def figures(*, full: bool, say: Say, seed: int | None = None, part: str | None = None) -> Iterator[Figure]:
+    """Measure every row, or those of one part; with `seed`, of one run in batch."""
+    if seed is not None:
+        yield from service_batch.figures(full=False, say=say, seeds=[seed])
+        return
+    if part is not None and part not in PARTS:
+        raise SystemExit(f"bench service --part {part}: choose from {', '.join(PARTS)}")
+    for name, measure in PARTS.items():
+        if part in (None, name):
+            say(name)
+            yield from measure(full=full, say=say)

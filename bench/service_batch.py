@@ -1,0 +1,86 @@
+"""The batch campaign: many seeded faults in virtual time, each bar over all runs, each kind with its count."""
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from bench.figure import Bar, Figure, judged
+from bench.journal import Journal
+from tests.faults import campaign
+from tests.faults.judge import BACK, BARS, BEGUN_CYCLES, LOST
+from tests.faults.kinds import KINDS
+
+RUNS = 2 * len(KINDS)
+FULL_RUNS = 900
+
+BEGUN = Bar("batch: stop begun after fault detection, worst run", "cycles", BEGUN_CYCLES)
+MISSED = {name: Bar(f"batch: {name}", "cycles" if name == LOST else "runs", 0.0) for name in BARS if name != BACK}
+RECOVERED = Bar("batch: armed again without a restart, where the fault is gone", "%", 100.0, True)
+COUNT = Bar("batch: runs", "runs")
+TIME = Bar("batch: time of a run, mean", "s")
+
+Say = Callable[[str], None]
+
+
+def figures(*, full: bool, say: Say, seeds: Sequence[int] | None = None) -> Iterator[Figure]:
+    """Play the seeds, or go on with what the journal has not; then judge them together."""
+    wanted = list(seeds) if seeds is not None else list(range(FULL_RUNS if full else RUNS))
+    journal = Journal("service-batch" if full and seeds is None else None)
+    with tempfile.TemporaryDirectory(prefix="stagectl-faults-") as folder:
+        for seed in wanted:
+            if seed in journal.entries:
+                continue
+            entry = as_entry(campaign.run(seed, Path(folder) / str(seed)))
+            journal.keep(seed, entry)
+            if seeds is not None or entry["violations"]:
+                say(entry["line"])
+            elif seed % 10 == 9:
+                say(f"{seed + 1} of {len(wanted)} runs")
+    yield from of_entries([journal.entries[seed] for seed in wanted], wanted)
+
+
+def as_entry(result: campaign.Result) -> dict:
+    """Return what the journal keeps of a run: plain JSON values."""
+    verdict = result.verdict
+    return {
+        "kind": result.kind,
+        "phase": result.phase,
+        "fault": result.fault_kind,
+        "line": result.line,
+        "skipped": result.reason,
+        "took_s": result.took_s,
+        "violations": [] if verdict is None else [list(one) for one in verdict.violations],
+        "begun_cycles": 0.0 if verdict is None else verdict.begun_cycles,
+        "cycles_lost": 0 if verdict is None else verdict.cycles_lost,
+        "drift_m": 0.0 if verdict is None else verdict.drift_m,
+    }
+
+
+def of_entries(entries: list[dict], seeds: list[int]) -> Iterator[Figure]:
+    """Hold all runs together against each bar."""
+    played = [entry for entry in entries if not entry["skipped"]]
+    yield judged(COUNT, len(played), seeds, _skipped(entries))
+    for name, bar in MISSED.items():
+        missed = [entry for entry in played if any(bar_name == name for bar_name, _ in entry["violations"])]
+        value = sum(entry["cycles_lost"] for entry in played) if name == LOST else len(missed)
+        yield judged(bar, value, reason="; ".join(entry["line"] for entry in missed[:3]))
+    yield judged(BEGUN, max((entry["begun_cycles"] for entry in played), default=0.0))
+    lame = [entry for entry in played if any(name == BACK for name, _ in entry["violations"])]
+    share = 100.0 * (1.0 - len(lame) / len(played)) if played else float("nan")
+    yield judged(RECOVERED, share, reason="; ".join(entry["line"] for entry in lame[:3]))
+    for kind in KINDS:
+        of_kind = [entry for entry in played if entry["kind"] == kind]
+        stopped = sorted({entry["fault"] for entry in of_kind if entry["fault"]})
+        phases = len({entry["phase"] for entry in of_kind})
+        said = f"in {phases} phases of motion; stopped by {', '.join(stopped)}" if stopped else f"in {phases} phases"
+        yield judged(Bar(f"batch: runs with {kind}", "runs"), len(of_kind), reason=said)
+    drift_m = max((entry["drift_m"] for entry in played), default=0.0)
+    yield judged(Bar("batch: drift of a macro without power after standstill, worst", "mm"), drift_m * 1e3)
+    yield judged(TIME, sum(entry["took_s"] for entry in played) / max(len(played), 1))
+
+
+def _skipped(entries: list[dict]) -> str:
+    reasons = {entry["skipped"] for entry in entries if entry["skipped"]}
+    return (
+        f"{sum(bool(entry['skipped']) for entry in entries)} skipped: {'; '.join(sorted(reasons))}" if reasons else ""
+    )

@@ -1,0 +1,234 @@
+"""Judges of a fault run: the rig's own log and the recorded files, by laws of motion alone. No code of the controller.
+
+The macro may go, from the fault on,
+
+    v t + a t^2 / 2 + (v + a t)^2 / (2 ramp)
+
+with v and a true at that instant, t the detection time and one cycle, and a no more than what a planned motion may
+reach within t. A macro without power has the way to its end stops instead.
+"""
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tests.faults.kinds import CYCLE_S, MACRO, Drawn
+from tests.faults.scene import Facts
+from tests.faults.witness import ENABLED, STOPPING
+
+RAMP_M_PER_S2 = 2.0  # the drive's, 0x6085
+PLAN_M_PER_S2, PLAN_M_PER_S3 = 0.9, 9.0  # what moves of this profile are planned with
+REST_M_PER_S = 1e-3
+STANDSTILL_M = 20e-6  # a drive that holds on its encoder gives way so far when a force changes
+REST_SAMPLES = 20
+LET_GO_M_PER_S = (
+    5e-3  # an axis that loses its power at rest begins to drift; faster than this it was let go of at speed
+)
+SETTLED_SAMPLES = 200  # a ramp's last micrometres are part of the stop
+BEGUN_CYCLES = 2
+STOPS_M = (-0.50, 0.50)  # the machine's
+STOPS_GIVE_M = 8e-3
+_POWERED = (ENABLED, *STOPPING)
+_LAW_STOPS, _ENDED = 5, (5, 6, 7, 8)  # run_phase
+
+TRAVEL, STANDSTILL = "travel beyond the bound", "followed a command after standstill"
+BEGUN, LOST, UNREADABLE = "stop begun late", "recorded cycles lost", "run unreadable"
+STRANGER, BACK, COURSE = "unauthorised command accepted", "not armed again", "went on, or stopped without need"
+BARS = (TRAVEL, STANDSTILL, BEGUN, LOST, UNREADABLE, STRANGER, BACK, COURSE)
+"""What a run can miss."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the judges found."""
+
+    violations: tuple[tuple[str, str], ...]
+    """Of `BARS`, with what was seen."""
+    stopped: bool
+    travel_m: float
+    bound_m: float
+    begun_cycles: float
+    cycles_lost: int
+    drift_m: float  # of an axis without power, after standstill; not judged
+
+
+class Record:
+    """Rows of all runs, each once, as the files have them."""
+
+    def __init__(self, folders: list[Path]) -> None:
+        """Read every file that there is; a file that can't be read is named in `unreadable`."""
+        self.unreadable: list[str] = []
+        pieces = []
+        for folder in folders:
+            try:
+                pieces.append(_columns(folder / "samples.arrow"))
+            except (OSError, pa.ArrowException) as error:
+                self.unreadable.append(f"{folder.name}: {error}")
+        joined = {name: np.concatenate([piece[name] for piece in pieces]) for name in _WANTED} if pieces else {}
+        if joined:
+            _, first = np.unique(joined["t_ns"], return_index=True)
+            joined = {name: values[first] for name, values in joined.items()}
+        self.columns: dict[str, np.ndarray] = joined or {name: np.zeros(0, np.int64) for name in _WANTED}
+
+    def noticed_t_ns(self, fault_t_ns: int) -> int | None:
+        """Return when the record first says that a stop was under way, after the fault."""
+        t_ns, phase, stop = (self.columns[name] for name in ("t_ns", "run_phase", "stop"))
+        after = np.flatnonzero(t_ns >= fault_t_ns)
+        if not after.size:
+            return None
+        before = int(phase[max(after[0] - 1, 0)])
+        found = after[(stop[after] > 0) | (np.isin(phase[after], _ENDED) & (phase[after] != before))]
+        return int(t_ns[found[0]]) if found.size else None
+
+
+_WANTED = ("t_ns", "run_phase", "stop", "setpoint_velocity_m_per_s")
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+    """Read the batches of an Arrow stream that are whole."""
+    batches = []
+    with pa.OSFile(str(path)) as file, pa.ipc.open_stream(file) as reader:
+        schema = reader.schema
+        with contextlib.suppress(pa.ArrowInvalid):  # the last batch of a run under way
+            while True:
+                try:
+                    batches.append(reader.read_next_batch().select(list(_WANTED)))
+                except StopIteration:
+                    break
+    table = pa.Table.from_batches(batches, pa.schema([schema.field(name) for name in _WANTED]))
+    return {name: table.column(name).to_numpy() for name in _WANTED}
+
+
+def judge(drawn: Drawn, facts: Facts, record: Record) -> Verdict:
+    """Hold one run against every bar."""
+    seen = facts.seen
+    t_ns, velocity, position = seen["t_ns"], seen["macro_velocity_m_per_s"], seen["macro_position_m"]
+    noticed = record.noticed_t_ns(facts.fault_t_ns)
+    noticed = noticed if noticed is not None and noticed < facts.judged_until_t_ns else None
+    stopped = bool(facts.fault_kind) or noticed is not None
+    found: list[tuple[str, str]] = []
+    if drawn.must_stop and not facts.fault_kind and facts.phase != "stopping":
+        found.append((COURSE, "it went on"))
+    if not drawn.may_stop and facts.fault_kind:
+        found.append((COURSE, f"stopped by {facts.fault_kind}"))
+    travel_m = bound_m = begun = drift_m = 0.0
+    if facts.fault_kind:
+        counts_from, detection_s = facts.fault_t_ns, drawn.detection_s
+        if not np.isfinite(detection_s):
+            counts_from, detection_s = noticed or facts.fault_t_ns, CYCLE_S
+        at = int(np.searchsorted(t_ns, counts_from))
+        end = int(np.searchsorted(t_ns, facts.judged_until_t_ns))
+        dark = MACRO in drawn.without_power
+        rest = _rest(seen, at, end, noticed)
+        travel_m = float(np.abs(position[at : rest or end] - position[at]).max(initial=0.0))
+        bound_m = _way_to_stops_m(velocity, position, at) if dark else _bound_m(t_ns, velocity, at, detection_s)
+        if not travel_m <= bound_m + STANDSTILL_M and not drawn.pushed:
+            found.append((TRAVEL, f"macro went {travel_m * 1e3:.3f} mm, bound {bound_m * 1e3:.3f} mm"))
+        if rest is None and not dark:
+            found.append((STANDSTILL, "it never stood still"))
+        found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
+        held_m, drift_m = _moved_after(seen, rest, end)
+        if held_m > STANDSTILL_M and not drawn.pushed:
+            found.append((STANDSTILL, f"macro moved {held_m * 1e6:.0f} um after standstill, with power"))
+        if noticed is not None and not dark:
+            begun = _begun_cycles(seen, record, noticed, facts.judged_until_t_ns)
+            if not begun <= BEGUN_CYCLES:
+                found.append((BEGUN, f"stop begun {begun:.0f} cycles after detection"))
+    lost = _cycles_lost(facts, record)
+    if lost:
+        found.append((LOST, f"{lost} cycles on the bus have no row"))
+    found += [(UNREADABLE, text) for text in record.unreadable]
+    found += [(STRANGER, name) for name in facts.accepted]
+    if facts.trouble:
+        found.append((BACK, facts.trouble))
+    return Verdict(tuple(found), stopped, travel_m, bound_m, begun, lost, drift_m)
+
+
+def _bound_m(t_ns: np.ndarray, velocity: np.ndarray, at: int, detection_s: float) -> float:
+    before = max(at - 10, 0)
+    span_s = 1e-9 * float(t_ns[at] - t_ns[before]) or CYCLE_S
+    a = abs(float(velocity[at] - velocity[before])) / span_s
+    t = detection_s + CYCLE_S
+    a = min(a + PLAN_M_PER_S3 * t, max(a, PLAN_M_PER_S2))
+    v = abs(float(velocity[at]))
+    return v * t + 0.5 * a * t * t + (v + a * t) ** 2 / (2.0 * RAMP_M_PER_S2)
+
+
+def _way_to_stops_m(velocity: np.ndarray, position: np.ndarray, at: int) -> float:
+    """Return the way of an axis without power: to the stop that it coasts to."""
+    low_m, high_m = STOPS_M
+    way_m = high_m - position[at] if velocity[at] > 0.0 else position[at] - low_m
+    return float(way_m) + STOPS_GIVE_M
+
+
+def _rest(seen: dict[str, Any], at: int, end: int, noticed_t_ns: int | None) -> int | None:
+    """Return the sample at which the macro had come to rest, or was let go of at rest; None where it did not."""
+    states, velocity = seen["states"][at:end, 0], seen["macro_velocity_m_per_s"][at:end]
+    starts = np.flatnonzero(states != ENABLED)[:1].tolist()
+    if noticed_t_ns is not None:
+        starts.append(max(0, int(np.searchsorted(seen["t_ns"], noticed_t_ns)) - at))
+    if not starts:
+        return None
+    first = min(starts)
+    slow = np.concatenate([[0], np.cumsum(np.abs(velocity[first:]) < REST_M_PER_S)])
+    found = np.flatnonzero(slow[REST_SAMPLES:] - slow[:-REST_SAMPLES] == REST_SAMPLES)[:1].tolist()
+    let_go = ~np.isin(states[first:], _POWERED) & (np.abs(velocity[first:]) < LET_GO_M_PER_S)
+    found += np.flatnonzero(let_go)[:1].tolist()
+    return at + first + min(found) if found else None
+
+
+def _enabled_again(seen: dict[str, Any], at: int, end: int) -> list[str]:
+    found = []
+    for axis, name in enumerate(("macro", "micro")):
+        enabled = seen["states"][at:end, axis] == ENABLED
+        off = np.flatnonzero(~enabled)
+        if off.size and enabled[off[0] :].any():
+            found.append(f"{name} was enabled again without an acknowledgement")
+    return found
+
+
+def _moved_after(seen: dict[str, Any], rest: int | None, end: int) -> tuple[float, float]:
+    """Return how far the macro moved with power after it stood, and how far without: that is a drift, not judged."""
+    if rest is None or rest + SETTLED_SAMPLES >= end:
+        return 0.0, 0.0
+    stands = rest + SETTLED_SAMPLES
+    powered = np.isin(seen["states"][stands:end, 0], _POWERED)
+    moved_m = np.abs(seen["macro_position_m"][stands:end] - seen["macro_position_m"][stands])
+    off = np.flatnonzero(~powered)
+    held_until = int(off[0]) if off.size else moved_m.size
+    return float(moved_m[:held_until].max(initial=0.0)), float(moved_m[~powered].max(initial=0.0))
+
+
+def _begun_cycles(seen: dict[str, Any], record: Record, noticed_t_ns: int, until_t_ns: int) -> float:
+    """Return the cycles from the row that noticed to the drive that no longer follows, or the reference that slows."""
+    t_ns, phase, speed = (record.columns[name] for name in ("t_ns", "run_phase", "setpoint_velocity_m_per_s"))
+    row = int(np.searchsorted(t_ns, noticed_t_ns))
+    at = int(np.searchsorted(seen["t_ns"], noticed_t_ns))
+    end = int(np.searchsorted(seen["t_ns"], until_t_ns))
+    left = np.flatnonzero(seen["states"][at:end, 0] != ENABLED)
+    drive_s = 1e-9 * float(seen["t_ns"][at + left[0]] - noticed_t_ns) if left.size else float("inf")
+    if phase[row] == _LAW_STOPS:
+        begin = abs(float(speed[max(row - 1, 0)]))
+        slower = np.flatnonzero(np.abs(speed[row:]) < begin)
+        law_s = 0.0 if begin == 0.0 else float("inf")
+        if slower.size and begin > 0.0:
+            law_s = 1e-9 * float(t_ns[row + slower[0]] - noticed_t_ns)
+        drive_s = min(drive_s, law_s)
+    return max(0.0, np.ceil(drive_s / CYCLE_S - 1.0))  # a state is seen at the sample after it changed
+
+
+def _cycles_lost(facts: Facts, record: Record) -> int:
+    """Count SYNCs on the bus that no row stands for, from the motion's begin to the end of watching.
+
+    A cycle has one SYNC, behind its row's instant and before the next one's.
+    """
+    t_ns = record.columns["t_ns"]
+    rows = t_ns[(t_ns >= facts.begun_t_ns) & (t_ns <= facts.judged_until_t_ns)]
+    sync = np.unique(facts.sync_t_ns)  # one that a fault doubled comes at one instant
+    if not rows.size:
+        return int(((sync > facts.begun_t_ns) & (sync <= facts.judged_until_t_ns)).sum())
+    return max(0, int(((sync > rows[0]) & (sync <= rows[-1] + 1_000_000)).sum()) - rows.size)

@@ -1,0 +1,395 @@
+"""What can go wrong, drawn from a seed: the fault, how soon it must be noticed, and whether the stage may go on.
+
+Numbers of detection are those of the profile and of the drives' own watches; nothing here asks the controller.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sim_backend.faults import Fault
+
+MACRO, MICRO = 1, 2  # node ids
+SYNC, MACRO_TPDO, MICRO_TPDO, MACRO_RPDO, MICRO_RPDO = 0x080, 0x181, 0x182, 0x201, 0x202
+MASTER_HEARTBEAT = 0x77E
+CYCLIC = (SYNC, MACRO_TPDO, MICRO_TPDO, MACRO_RPDO, MICRO_RPDO)
+TPDOS, RPDOS = (MACRO_TPDO, MICRO_TPDO), (MACRO_RPDO, MICRO_RPDO)
+
+CYCLE_S = 1e-3
+SILENCE_S = 0.021  # 20 cycles without process data, RPDO or SYNC, and the one that notices
+AT_ONCE_S = 0.003  # a line on its way, the cycle that reads it, one more
+_HEARTBEAT_S = 0.265  # trip.heartbeat_s, a heartbeat's own period, and two looks of the supervisor
+_MASTER_HEARTBEAT_S = 0.205
+_SUPERVISOR_S = 0.5 + 2 * CYCLE_S
+_LEASE_S = 2.0  # what a lease lasts that nobody renews
+FRAME_S = 130e-6  # eight bytes at 1 Mbit/s
+NEVER_S = float("inf")
+
+MOVING = ("accelerating", "constant speed", "decelerating")
+PHASES = ("at rest", *MOVING, "jogging", "identifying", "homing", "stopping")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One fault as it was drawn."""
+
+    text: str
+    faults: tuple[Fault, ...] = ()
+    act: Callable[[Any], None] | None = None  # on a scene, for what no rig can do: host, client, disk
+    must_stop: bool = True
+    may_stop: bool = True
+    detection_s: float = NEVER_S  # NEVER_S: from the instant that the controller says it noticed
+    lasts_s: float = 0.0
+    without_power: tuple[int, ...] = ()  # nodes that can't brake
+    pushed: bool = False  # by something that is no command: how far is not judged
+
+
+Draw = Callable[[np.random.Generator, str], Drawn]
+
+
+def _of(rng: np.random.Generator, values):
+    return values[int(rng.integers(len(values)))]
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw evenly in the logarithm."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _lost(rng: np.random.Generator, ids: tuple[int, ...], low_s: float, detection_s: float, what: str) -> Drawn:
+    can_id, duration_s = _of(rng, ids), _between(rng, low_s, 0.6)
+    fault = Fault("drop_frame", can_id=can_id, duration_s=duration_s)
+    must = duration_s > detection_s + 0.01
+    return Drawn(
+        f"{what} 0x{can_id:03X} lost for {duration_s * 1e3:.0f} ms",
+        (fault,),
+        must_stop=must,
+        detection_s=detection_s if must else NEVER_S,
+        lasts_s=duration_s,
+    )
+
+
+def frames_lost(rng: np.random.Generator, phase: str) -> Drawn:
+    return _lost(rng, CYCLIC, 2e-3, SILENCE_S, "frame")
+
+
+def few_frames_lost(rng: np.random.Generator, phase: str) -> Drawn:
+    ids = (*CYCLIC, 0x081, 0x082, 0x281, 0x282)
+    can_id, count = _of(rng, ids), int(rng.integers(1, 4))
+    fault = Fault("drop_frame", can_id=can_id, count=count, duration_s=0.3)
+    return Drawn(f"{count} frames 0x{can_id:03X} lost", (fault,), must_stop=False, lasts_s=0.3)
+
+
+def frames_late(rng: np.random.Generator, phase: str) -> Drawn:
+    can_id, delay_s, duration_s = _of(rng, CYCLIC), _between(rng, 3e-4, 8e-3), _between(rng, 0.01, 0.3)
+    fault = Fault("delay_frame", can_id=can_id, delay_s=delay_s, duration_s=duration_s)
+    text = f"frame 0x{can_id:03X} late by {delay_s * 1e3:.1f} ms for {duration_s * 1e3:.0f} ms"
+    return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
+
+
+def frames_reordered(rng: np.random.Generator, phase: str) -> Drawn:
+    """By one to three frames' time: an RPDO comes behind its SYNC, a TPDO behind the other's."""
+    can_id, delay_s, duration_s = _of(rng, (*TPDOS, *RPDOS)), _between(rng, 1e-4, 3e-4), _between(rng, 0.01, 0.5)
+    fault = Fault("delay_frame", can_id=can_id, delay_s=delay_s, duration_s=duration_s)
+    text = f"frame 0x{can_id:03X} behind its followers for {duration_s * 1e3:.0f} ms"
+    return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
+
+
+def frames_doubled(rng: np.random.Generator, phase: str) -> Drawn:
+    can_id, duration_s = _of(rng, CYCLIC), _between(rng, 0.01, 0.5)
+    fault = Fault("duplicate_frame", can_id=can_id, duration_s=duration_s)
+    return Drawn(
+        f"frame 0x{can_id:03X} doubled for {duration_s * 1e3:.0f} ms", (fault,), must_stop=False, lasts_s=duration_s
+    )
+
+
+def frames_corrupted(rng: np.random.Generator, phase: str) -> Drawn:
+    """Bits turn over behind the bus's own check: a gateway, a driver's bug."""
+    can_id, count = _of(rng, (*TPDOS, *RPDOS)), int(rng.integers(1, 6))
+    bits = sum(1 << int(k) for k in rng.choice(32, size=int(rng.integers(1, 4)), replace=False))
+    fault = Fault("corrupt_frame", can_id=can_id, bits=bits, count=count, duration_s=0.1)
+    return Drawn(f"{count} frames 0x{can_id:03X} with bits 0x{bits:08X}", (fault,), must_stop=False, lasts_s=0.1)
+
+
+def frames_short(rng: np.random.Generator, phase: str) -> Drawn:
+    can_id = _of(rng, (*TPDOS, *RPDOS))
+    length = int(rng.integers(0, 4))
+    fault = Fault("short_frame", can_id=can_id, length_count=length, duration_s=0.05)
+    return Drawn(f"frame 0x{can_id:03X} of {length} bytes", (fault,), detection_s=AT_ONCE_S, lasts_s=0.05)
+
+
+def bus_off(rng: np.random.Generator, phase: str) -> Drawn:
+    duration_s = _between(rng, 0.01, 0.8)
+    fault = Fault("bus_off", duration_s=duration_s)
+    return Drawn(f"bus-off for {duration_s * 1e3:.0f} ms", (fault,), detection_s=AT_ONCE_S, lasts_s=duration_s)
+
+
+def bus_full(rng: np.random.Generator, phase: str) -> Drawn:
+    """A node with a better id talks: nothing else gets through, and the queue refuses (ENOBUFS)."""
+    count = round(_between(rng, 30, 3000))
+    duration_s = count * FRAME_S
+    must = duration_s > 2.5 * SILENCE_S
+    return Drawn(
+        f"bus full for {duration_s * 1e3:.0f} ms",
+        (Fault("flood", node_id=MACRO, can_id=0x001, count=count),),
+        must_stop=must,
+        detection_s=2 * SILENCE_S if must else NEVER_S,
+        lasts_s=duration_s,
+    )
+
+
+def emergency(rng: np.random.Generator, phase: str) -> Drawn:
+    node_id, code = _of(rng, (MACRO, MICRO)), _of(rng, (0x2310, 0x3210, 0x4210, 0x7305, 0x8611))
+    fault = Fault("emergency", node_id=node_id, code=code)
+    return Drawn(f"EMCY 0x{code:04X} of node {node_id}", (fault,), detection_s=AT_ONCE_S)
+
+
+def statusword_stuck(rng: np.random.Generator, phase: str) -> Drawn:
+    node_id, duration_s = _of(rng, (MACRO, MICRO)), _between(rng, 0.05, 1.0)
+    fault = Fault("stuck_statusword", node_id=node_id, duration_s=duration_s)
+    text = f"statusword of node {node_id} stuck for {duration_s * 1e3:.0f} ms"
+    return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
+
+
+def drive_reboot(rng: np.random.Generator, phase: str) -> Drawn:
+    node_id, duration_s = _of(rng, (MACRO, MICRO)), _between(rng, 0.03, 1.0)
+    fault = Fault("power_loss", node_id=node_id, duration_s=duration_s)
+    text = f"node {node_id} dark for {duration_s * 1e3:.0f} ms, then boots"
+    return Drawn(text, (fault,), detection_s=SILENCE_S, lasts_s=duration_s, without_power=(node_id,))
+
+
+_CHANGES = (
+    ("TPDO1 carries the inputs for the position", 0x1A00, 2, 0x60FD_0020),
+    ("TPDO1 off", 0x1800, 1, 0xC000_0180),
+    ("RPDO1 off", 0x1400, 1, 0x8000_0200),
+)
+
+
+def mapping_changed(rng: np.random.Generator, phase: str) -> Drawn:
+    """Another master's tool configures a drive while it works."""
+    what, index, subindex, value = _of(rng, _CHANGES)
+    node_id = MACRO if index == 0x1A00 else _of(rng, (MACRO, MICRO))
+    if index != 0x1A00:
+        value |= node_id
+    fault = Fault("object_change", node_id=node_id, index=index, subindex=subindex, value=value)
+    return Drawn(f"node {node_id}: {what}", (fault,), detection_s=SILENCE_S)
+
+
+def drive_heartbeat_lost(rng: np.random.Generator, phase: str) -> Drawn:
+    node_id, duration_s = _of(rng, (MACRO, MICRO)), _between(rng, 0.05, 1.0)
+    must = duration_s > _HEARTBEAT_S + 0.1
+    return Drawn(
+        f"no heartbeat of node {node_id} for {duration_s * 1e3:.0f} ms",
+        (Fault("heartbeat_silence", node_id=node_id, duration_s=duration_s),),
+        must_stop=must,
+        detection_s=_HEARTBEAT_S if must else NEVER_S,
+        lasts_s=duration_s,
+    )
+
+
+def master_heartbeat_lost(rng: np.random.Generator, phase: str) -> Drawn:
+    return _lost(rng, (MASTER_HEARTBEAT,), 0.05, _MASTER_HEARTBEAT_S, "heartbeat")
+
+
+def encoder_glitch(rng: np.random.Generator, phase: str) -> Drawn:
+    """Counts appear from nowhere; what is less than 50 um and a period's way is not told apart from jitter."""
+    offset_m, duration_s = _between(rng, 5e-6, 5e-3) * _of(rng, (-1.0, 1.0)), _between(rng, 1e-3, 0.5)
+    must = abs(offset_m) > 1.2e-3 and duration_s > 0.03
+    return Drawn(
+        f"macro encoder off by {offset_m * 1e6:.0f} um for {duration_s * 1e3:.0f} ms",
+        (Fault("encoder_jump", node_id=MACRO, offset_m=offset_m, duration_s=duration_s),),
+        must_stop=must,
+        detection_s=0.02 if must else NEVER_S,
+        lasts_s=duration_s,
+    )
+
+
+def beam_break(rng: np.random.Generator, phase: str) -> Drawn:
+    axis, duration_s = _of(rng, ("macro", "end", "both")), _between(rng, 2e-3, 0.8)
+    fault = Fault("beam_loss", axis=axis, duration_s=duration_s)
+    return Drawn(
+        f"no beam on {axis} for {duration_s * 1e3:.0f} ms", (fault,), detection_s=AT_ONCE_S, lasts_s=duration_s
+    )
+
+
+def sensor_silence(rng: np.random.Generator, phase: str) -> Drawn:
+    duration_s = _between(rng, 1e-3, 0.8)
+    must = duration_s > SILENCE_S + 5e-3
+    return Drawn(
+        f"interferometer silent for {duration_s * 1e3:.0f} ms",
+        (Fault("sensor_silence", duration_s=duration_s),),
+        must_stop=must,
+        detection_s=SILENCE_S + CYCLE_S if must else NEVER_S,
+        lasts_s=duration_s,
+    )
+
+
+def sensor_garbage(rng: np.random.Generator, phase: str) -> Drawn:
+    count = round(_between(rng, 1, 4000))
+    lines = int(rng.integers(0, 15))
+    faults = [Fault("garbage", count=count)]
+    faults += [Fault("half_line", at_s=k * CYCLE_S, length_count=int(rng.integers(0, 25))) for k in range(lines)]
+    return Drawn(f"{count} bytes of garbage, {lines} half lines", tuple(faults), must_stop=False, lasts_s=0.1)
+
+
+def sequence_gap(rng: np.random.Generator, phase: str) -> Drawn:
+    count = round(_between(rng, 2, 5000))
+    return Drawn(f"{count} sequence numbers skipped", (Fault("sequence_gap", count=count),), detection_s=AT_ONCE_S)
+
+
+def sensor_restart(rng: np.random.Generator, phase: str) -> Drawn:
+    return Drawn("interferometer restarted", (Fault("sensor_restart"),), detection_s=AT_ONCE_S)
+
+
+def counts_stuck(rng: np.random.Generator, phase: str) -> Drawn:
+    duration_s = _between(rng, 0.03, 0.8)
+    fault = Fault("stuck_counts", duration_s=duration_s)
+    must = phase == "constant speed"
+    return Drawn(
+        f"counts stuck for {duration_s * 1e3:.0f} ms",
+        (fault,),
+        must_stop=must,
+        detection_s=0.01 if must else NEVER_S,
+        lasts_s=duration_s,
+    )
+
+
+def clock_drift(rng: np.random.Generator, phase: str) -> Drawn:
+    ppm, duration_s = _between(rng, 5.0, 2e4) * _of(rng, (-1.0, 1.0)), _between(rng, 0.1, 1.0)
+    fault = Fault("clock_drift", ppm=ppm, duration_s=duration_s)
+    text = f"interferometer's clock {ppm:.0f} ppm off for {duration_s * 1e3:.0f} ms"
+    return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
+
+
+def unplugged(rng: np.random.Generator, phase: str) -> Drawn:
+    duration_s = _between(rng, 5e-3, 0.8)
+    fault = Fault("unplug", duration_s=duration_s)
+    text = f"interferometer unplugged for {duration_s * 1e3:.0f} ms"
+    return Drawn(text, (fault,), detection_s=AT_ONCE_S, lasts_s=duration_s)
+
+
+_INPUTS = (("limit switch", MACRO, 0x2), ("pressure low", MACRO, 0x1_0000), ("STO", MICRO, 0x8), ("STO", MACRO, 0x8))
+
+
+def input_trips(rng: np.random.Generator, phase: str) -> Drawn:
+    what, node_id, bits = _of(rng, _INPUTS)
+    duration_s = _between(rng, 0.1, 1.0)
+    fault = Fault("input", node_id=node_id, bits=bits, duration_s=duration_s)
+    return Drawn(
+        f"{what} of node {node_id} for {duration_s * 1e3:.0f} ms",
+        (fault,),
+        detection_s=0.012,  # the event-driven TPDO's inhibit time
+        lasts_s=duration_s,
+        without_power=(node_id,) if bits == 0x8 else (),
+    )
+
+
+def edge_jump(rng: np.random.Generator, phase: str) -> Drawn:
+    offset_m = rng.uniform(-120e-6, 400e-6)
+    return Drawn(
+        f"right edge of the joint moves by {offset_m * 1e6:.0f} um",
+        (Fault("edge_jump", offset_m=float(offset_m)),),
+        must_stop=False,
+    )
+
+
+def obstacle(rng: np.random.Generator, phase: str) -> Drawn:
+    """Something lies in the way of the macro: a following error."""
+    offset_m = _between(rng, 1e-3, 60e-3)
+    faults = tuple(Fault("obstacle", offset_m=side * offset_m, duration_s=1.5) for side in (-1.0, 1.0))
+    return Drawn(f"obstacles {offset_m * 1e3:.0f} mm away", faults, must_stop=False, lasts_s=1.5, pushed=True)
+
+
+def host_held_up(rng: np.random.Generator, phase: str) -> Drawn:
+    duration_s = _between(rng, 5e-3, 0.5)
+    must = duration_s > SILENCE_S + 2e-3
+    return Drawn(
+        f"host held up for {duration_s * 1e3:.0f} ms",
+        act=lambda scene: scene.hold_host_up(duration_s),
+        must_stop=must,
+        detection_s=SILENCE_S if must else NEVER_S,
+        lasts_s=duration_s,
+    )
+
+
+def supervisor_hangs(rng: np.random.Generator, phase: str) -> Drawn:
+    duration_s = float(rng.uniform(0.05, 1.2))
+    must = duration_s > 0.52
+    return Drawn(
+        f"supervisor hangs for {duration_s * 1e3:.0f} ms",
+        act=lambda scene: scene.hang_supervisor(duration_s),
+        must_stop=must,
+        detection_s=_SUPERVISOR_S if must else NEVER_S,
+        lasts_s=duration_s,
+    )
+
+
+def servo_gone(rng: np.random.Generator, phase: str) -> Drawn:
+    return Drawn("servo gone", act=lambda scene: scene.lose_servo(), detection_s=SILENCE_S, lasts_s=1.0)
+
+
+def disk_full(rng: np.random.Generator, phase: str) -> Drawn:
+    return Drawn("disk full", act=lambda scene: scene.fill_disk(), must_stop=False, lasts_s=1.0)
+
+
+def client_vanishes(rng: np.random.Generator, phase: str) -> Drawn:
+    return Drawn("client vanishes", act=lambda scene: scene.vanish(), detection_s=_LEASE_S + CYCLE_S)
+
+
+def second_operator(rng: np.random.Generator, phase: str) -> Drawn:
+    return Drawn(
+        "a second operator wants to move",
+        act=lambda scene: scene.intrude(rng),
+        must_stop=False,
+        may_stop=False,
+    )
+
+
+def nonsense_profile(rng: np.random.Generator, phase: str) -> Drawn:
+    return Drawn(
+        "profile edited to nonsense, read again",
+        act=lambda scene: scene.edit_profile(rng),
+        must_stop=False,
+        may_stop=False,
+    )
+
+
+KINDS: dict[str, Draw] = {
+    "frames lost": frames_lost,
+    "few frames lost": few_frames_lost,
+    "frames late": frames_late,
+    "frames reordered": frames_reordered,
+    "frames doubled": frames_doubled,
+    "frames corrupted": frames_corrupted,
+    "frames short": frames_short,
+    "bus-off and back": bus_off,
+    "bus full (ENOBUFS)": bus_full,
+    "EMCY": emergency,
+    "statusword stuck": statusword_stuck,
+    "drive reboot": drive_reboot,
+    "mapping changed": mapping_changed,
+    "drive's heartbeat lost": drive_heartbeat_lost,
+    "master's heartbeat lost": master_heartbeat_lost,
+    "encoder glitch": encoder_glitch,
+    "beam break": beam_break,
+    "interferometer silent": sensor_silence,
+    "interferometer garbage": sensor_garbage,
+    "sequence gap": sequence_gap,
+    "interferometer restart": sensor_restart,
+    "counts stuck": counts_stuck,
+    "clock drift": clock_drift,
+    "unplug and replug": unplugged,
+    "input trips": input_trips,
+    "backlash jump": edge_jump,
+    "obstacle (following error)": obstacle,
+    "host overrun": host_held_up,
+    "supervisor hangs": supervisor_hangs,
+    "servo gone": servo_gone,
+    "disk full": disk_full,
+    "client vanishes": client_vanishes,
+    "two operators": second_operator,
+    "nonsense profile": nonsense_profile,
+}
+"""Every kind, by the name that the tables use."""

@@ -1,0 +1,114 @@
+"""`python -m bench service`: what it makes of its runs, its journal, and its mutants."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench import service, service_batch
+from bench.journal import Journal
+from bench.mutation import mutants, uncompiled
+from bench.service_mutants import MODULES, equivalent
+from tests.faults.judge import BACK, LOST, TRAVEL
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCE = '''
+LIMIT = 3
+
+
+def step(a, b):
+    """Say which is more."""
+    if a < b and not a == LIMIT:
+        return a + b
+    return max(a, b)
+'''
+
+
+def entry(kind: str, *violations: tuple[str, str], lost: int = 0, skipped: str = "") -> dict:
+    return {
+        "kind": kind,
+        "phase": "at rest",
+        "fault": "EMERGENCY",
+        "line": f"{kind}: python -m bench service --seed 1",
+        "skipped": skipped,
+        "took_s": 1.0,
+        "violations": [list(one) for one in violations],
+        "begun_cycles": 1.0,
+        "cycles_lost": lost,
+        "drift_m": 0.0,
+    }
+
+
+def test_one_bad_run_is_a_missed_bar_and_says_how_to_see_it_again():
+    entries = [entry("EMCY"), entry("EMCY", (TRAVEL, "5 mm"), (BACK, "no")), entry("disk full", skipped="no root")]
+    found = {figure.figure: figure for figure in service_batch.of_entries(entries, [0, 1, 2])}
+    assert found[f"batch: {TRAVEL}"].holds is False
+    assert "python -m bench service --seed 1" in found[f"batch: {TRAVEL}"].reason
+    assert found[f"batch: {LOST}"].holds is True
+    assert found["batch: runs"].value == 2
+    assert found["batch: runs"].reason == "1 skipped: no root"
+    assert found["batch: runs with EMCY"].value == 2
+    assert found[service_batch.RECOVERED.figure].value == pytest.approx(50.0)
+    lost = {figure.figure: figure for figure in service_batch.of_entries([entry("EMCY", (LOST, "3"), lost=3)], [0])}
+    assert (lost[f"batch: {LOST}"].value, lost[f"batch: {LOST}"].holds) == (3.0, False)
+
+
+def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    Journal("test").keep(4, {"line": "four"})
+    (path,) = (tmp_path / "stagectl-bench").glob("test-*.jsonl")
+    path.write_text(path.read_text() + '{"seed": 5, "li')  # killed in the middle of a line
+    Journal("test").keep(6, {"line": "six"})
+    assert Journal("test").entries == {4: {"line": "four"}, 6: {"line": "six"}}
+    assert Journal(None).entries == {}
+
+
+def test_parts_are_named():
+    assert {"batch", "mutants"} <= set(service.PARTS)
+    with pytest.raises(SystemExit, match="choose from batch, "):
+        list(service.figures(full=False, say=lambda text: None, part="nothing"))
+
+
+def test_mutants_are_small_changes_that_differ_from_the_code_and_from_each_other():
+    made = mutants(SOURCE)
+    plain = ast.unparse(ast.parse(SOURCE))
+    for mutant in made:
+        assert ast.unparse(mutant.apply()) != plain, mutant.key
+        mutant.revert()
+        assert ast.unparse(mutant.tree) == plain
+    keys = {mutant.key for mutant in made}
+    assert len(keys) == len(made)
+    assert {
+        "module: in LIMIT = 3: 3 -> 4",
+        "step: a < b -> a <= b",
+        "step: a < b and (not a == LIMIT) -> a < b or not a == LIMIT",
+        "step: not a == LIMIT -> a == LIMIT",
+        "step: a + b -> a - b",
+        "step: max(a, b) -> min(a, b)",
+        "step: return a + b -> nothing",
+        "step: if a < b and (not a == LIMIT): -> if True:",
+    } <= keys
+    assert not [key for key in keys if "Say which" in key]
+
+
+def test_uncompiled_code_sees_fields_of_a_row():
+    rows = np.zeros(1, [("force_n", "f8"), ("cycle", "i8")])
+
+    @uncompiled
+    def step(row, added):
+        row.force_n += added
+        return row.cycle
+
+    rows["cycle"] = 7
+    assert step(rows[0], 2.5) == 7
+    assert rows["force_n"][0] == 2.5
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_equivalent_mutant_exists_and_has_a_reason(module):
+    source = (ROOT / (module.replace(".", "/") + ".py")).read_text()
+    keys = {mutant.key for mutant in mutants(source)}
+    for key, reason in equivalent().get(module, {}).items():
+        assert key in keys
+        assert len(reason) > 20

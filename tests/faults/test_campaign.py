@@ -1,0 +1,121 @@
+"""The campaign in short: a few seeds of it, and judges that see what they are there for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.faults import campaign
+from tests.faults.judge import BACK, BEGUN, COURSE, LOST, STANDSTILL, STRANGER, TRAVEL, Record, judge
+from tests.faults.kinds import KINDS, SILENCE_S, Drawn
+from tests.faults.scene import Facts
+from tests.faults.witness import ENABLED
+
+SEEDS = (0, 8, 12)
+_STOPPED = 5  # QUICK_STOP_ACTIVE
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_seed_of_the_campaign(seed, tmp_path):
+    result = campaign.run(seed, tmp_path / "run")
+    assert result.verdict is not None
+    assert result.verdict.violations == (), result.line
+
+
+def test_every_kind_is_drawn_and_a_seed_is_the_same_run_again():
+    drawn = [campaign.drawn(seed) for seed in range(len(KINDS))]
+    assert [kind for kind, *_ in drawn] == list(KINDS)
+    assert [one[2].text for one in drawn] == [campaign.drawn(seed)[2].text for seed in range(len(KINDS))]
+
+
+def rest_after(ramp_m_per_s2: float, noticed_s: float = 0.02) -> tuple[Facts, Record]:
+    """Make the log of a macro at 0.4 m/s that a fault at 1 s stops, as it should be: 1 kHz, 2 s."""
+    t_s = np.arange(2000) * 1e-3
+    speed = 0.4 - ramp_m_per_s2 * (t_s - 1.0 - noticed_s).clip(min=0.0)
+    velocity = speed.clip(min=0.0)
+    states = np.full((2000, 2), ENABLED)
+    states[t_s > 1.0 + noticed_s] = _STOPPED
+    seen = {
+        "t_ns": (t_s * 1e9).astype(np.int64),
+        "macro_velocity_m_per_s": velocity,
+        "macro_position_m": np.cumsum(velocity) * 1e-3,
+        "states": states,
+    }
+    facts = Facts(
+        fault_t_ns=1_000_000_000,
+        judged_until_t_ns=1_900_000_000,
+        begun_t_ns=500_000_000,
+        phase="constant speed",
+        fault_kind="LINK_SILENT",
+        seen=seen,
+        sync_t_ns=seen["t_ns"] + 400_000,
+    )
+    record = Record([])
+    noticed = seen["t_ns"] >= round(1e9 * (1.0 + noticed_s))
+    record.columns = {
+        "t_ns": seen["t_ns"],
+        "run_phase": np.where(noticed, 6, 4),
+        "stop": np.where(noticed, 18, 0),
+        "setpoint_velocity_m_per_s": velocity,
+    }
+    return facts, record
+
+
+FAULT = Drawn("frames lost", detection_s=SILENCE_S, lasts_s=0.3)
+
+
+def bars_missed(facts: Facts, record: Record, drawn: Drawn = FAULT) -> set[str]:
+    return {bar for bar, _ in judge(drawn, facts, record).violations}
+
+
+def test_a_stop_as_it_should_be_misses_no_bar():
+    facts, record = rest_after(2.0)
+    verdict = judge(FAULT, facts, record)
+    assert verdict.violations == ()
+    assert verdict.travel_m == pytest.approx(0.4 * 0.02 + 0.4**2 / 4.0, abs=1e-3)
+    assert verdict.bound_m == pytest.approx(0.4 * 0.022 + 0.4**2 / 4.0, rel=0.05)
+
+
+def test_judges_see_a_stop_that_is_too_late_or_too_gentle():
+    assert bars_missed(*rest_after(1.6)) == {TRAVEL}
+    assert bars_missed(*rest_after(2.0, noticed_s=0.06)) == {TRAVEL}
+
+
+def test_judges_see_a_drive_that_goes_on_after_detection():
+    facts, record = rest_after(2.0)
+    facts.seen["states"][1000:1040] = ENABLED
+    assert BEGUN in bars_missed(facts, record)
+
+
+def test_judges_see_a_stage_that_moves_again():
+    facts, record = rest_after(2.0)
+    facts.seen["macro_position_m"][1600:] += 30e-6
+    assert bars_missed(facts, record) == {STANDSTILL}
+    facts, record = rest_after(2.0)
+    facts.seen["states"][1700:1705, 1] = ENABLED
+    assert bars_missed(facts, record) == {STANDSTILL}
+
+
+def test_a_drift_without_power_is_measured_and_no_command():
+    facts, record = rest_after(2.0)
+    facts.seen["states"][1500:] = 1
+    facts.seen["macro_position_m"][1600:] += 30e-6
+    verdict = judge(FAULT, facts, record)
+    assert verdict.violations == ()
+    assert verdict.drift_m == pytest.approx(30e-6)
+
+
+def test_judges_see_cycles_without_a_row():
+    facts, record = rest_after(2.0)
+    record.columns = {name: np.delete(values, slice(1200, 1203)) for name, values in record.columns.items()}
+    verdict = judge(FAULT, facts, record)
+    assert {bar for bar, _ in verdict.violations} == {LOST}
+    assert verdict.cycles_lost == 3
+
+
+def test_judges_see_what_should_not_have_happened():
+    facts, record = rest_after(2.0)
+    assert bars_missed(facts, record, replace(FAULT, may_stop=False)) == {COURSE}
+    assert bars_missed(replace(facts, fault_kind=""), record) == {COURSE}
+    assert bars_missed(replace(facts, accepted=["move"]), record) == {STRANGER}
+    assert bars_missed(replace(facts, trouble="not homed"), record) == {BACK}
