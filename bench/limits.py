@@ -42,9 +42,7 @@ def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
             least = found[0].bounds.robust
             said = f"Ms {least.robustness.max_sensitivity:.2f}; the law's {found[0].margins.sensitivity_peak_ratio:.2f}"
             yield judged(LEAST, 1e9 * least.true_rms_m, reason=said)
-            yield judged(
-                OVER, found[0].hold_m / least.true_rms_m, reason="whatever a force does to that loop: decision 0017"
-            )
+            yield judged(OVER, found[0].hold_m / least.true_rms_m, reason="whatever a force does: decision 0017")
             as_stiff = found[0].bounds.as_stiff
             over = found[0].hold_m / as_stiff.true_rms_m if as_stiff is not None else 0.0
             yield judged(OVER_AS_STIFF, over, reason=f"0.1 N moves the end by {found[0].step_peak_m * 1e9:.0f} nm")
