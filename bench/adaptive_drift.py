@@ -5,6 +5,7 @@ them has an honest interval. What `--full` simulates is 10 h; the rest to 200 h 
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from bench.figure import Bar, Figure, judged
 from stagectl import batch, tick
 from stagectl.laws.reference import gap_centre
 from stagectl.profile import Profile
-from stagectl.signals import SETPOINT
+from stagectl.signals import SETPOINT, Stop
 
 RATE = Bar("adaptive gain at rest: settles at, over the leak that it is given", "1")
 MEAN = Bar("adaptive gain at rest, 5 nm: mean over its ceiling", "1")
@@ -43,7 +44,9 @@ def figures(*, full: bool, say: Say) -> Iterator[Figure]:
     yield judged(MEAN, float(np.mean(gain)) / ceiling, [_SEED], f"{gain.size} samples, {hours:g} h simulated")
     foretold, sd = foretold_after(gain, hours, _FORETOLD_H)
     said = f"{hours:g} h simulated, the rest foretold: {foretold / ceiling:.4f} +- {_NORMAL_95 * sd / ceiling:.4f}"
-    yield judged(DRIFT, (foretold + _NORMAL_95 * sd) / ceiling, [_SEED], said)
+    # A quarter of an hour says little of 200 h: its interval is wider than the ceiling, and judged is the long run.
+    bar = DRIFT if full else replace(DRIFT, limit=None)
+    yield judged(bar, (foretold + _NORMAL_95 * sd) / ceiling, [_SEED], said)
 
 
 def foretold_after(gain: np.ndarray, hours: float, foretold_h: float) -> tuple[float, float]:
@@ -62,13 +65,16 @@ def _resting(profile: Profile) -> batch.Simulation:
     controller = tick.controller(profile, "dsmc", has_drives=False)
     delay_s = profile.cycle.actuation_delay_s
     simulation = batch.simulation(controller, limit.machine(profile, 1.01, 1.2), latch_delay_s=delay_s, seed=_SEED)
+    simulation.state["end_position_m"] = 0.0
     simulation.state["macro_position_m"] = float(gap_centre(controller.belief[0]))
     _hold(simulation, profile, _SETTLED_S)
     return simulation
 
 
 def _hold(simulation: batch.Simulation, profile: Profile, duration_s: float) -> float:
-    batch.run(simulation, np.zeros(round(duration_s * profile.cycle.rate_hz), SETPOINT))
+    recording = batch.run(simulation, np.zeros(round(duration_s * profile.cycle.rate_hz), SETPOINT))
+    if recording.commands["stop"][-1] != Stop.NONE:
+        raise RuntimeError("the hold was stopped: this row would show nothing")
     return float(simulation.controller.law["adaptive_gain_ratio"][0])
 
 
