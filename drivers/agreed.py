@@ -4,10 +4,12 @@ A drive that restarted has forgotten all of it, and another master's tool may ha
 take its frames for something else than they are. Knows no bus: it speaks through a master.
 """
 
+import contextlib
 from typing import TYPE_CHECKING
 
 from drivers import cia402
 from drivers.arming import DriveSettings, needed_objects
+from stagectl.errors import DriveError
 
 if TYPE_CHECKING:
     from drivers.canopen_master import Master
@@ -29,8 +31,12 @@ Agreed = dict[tuple[int, int], int]
 def read_agreed(master: "Master", drive: DriveSettings) -> Agreed:
     """Read every object that a configured drive must keep. Errors: LinkError, DriveError."""
     objects = [place for place in needed_objects(drive.mode, homes=False) if place[0] not in _CHANGING]
-    objects += [place for place in _WHERE_IT_EXISTS if master.has(drive.node_id, *place)]
-    return {place: master.read(drive.node_id, *place) for place in objects}
+    agreed = {place: master.read(drive.node_id, *place) for place in objects}
+    for place in _WHERE_IT_EXISTS:
+        if master.has(drive.node_id, *place):
+            with contextlib.suppress(DriveError):  # an EDS file may promise what a drive's firmware has not
+                agreed[place] = master.read(drive.node_id, *place)
+    return agreed
 
 
 def changed(master: "Master", node_id: int, agreed: Agreed) -> str:

@@ -125,8 +125,10 @@ class Master:
 
     def nmt(self, node_id: int, command: int | str) -> None:
         """Send an NMT command, a code or a name ("start", "stop", "pre-operational", "reset-node",
-        "reset-communication"), to a node, 0 = all."""
+        "reset-communication"), to a node, 0 = all. What heartbeats said before it is forgotten."""
         code = _NMT_NAMES[command] if isinstance(command, str) else command
+        for known in [node_id] if node_id else list(self._nmt_state):
+            self._nmt_state.pop(known, None)
         self._guarded_send(0x000, bytes((code, node_id)))
 
     def has(self, node_id: int, index: int, subindex: int = 0) -> bool:
