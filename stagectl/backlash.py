@@ -141,7 +141,8 @@ def believed_doubts(profile: "Profile") -> Doubts:
     """Return what a profile leaves open: the micro's mass, or the force constant by as much, scaling every force.
 
     And where the spring between the stages stands at its middle: zeros are laid by the edges, and 4 um beside it are
-    2 mN of offset, which went into both edges (0.2 um).
+    2 mN of offset, which went into both edges (0.2 um). Of two edges that are off on their own, the middle is off by
+    half of what the width is.
     """
     if profile.micro is None:
         return Doubts()
@@ -149,7 +150,7 @@ def believed_doubts(profile: "Profile") -> Doubts:
     ratio = micro.mass_sd_kg / micro.mass_kg
     force_n = 0.0
     if profile.backlash is not None:
-        force_n = min(micro.spring_n_per_m * profile.backlash.width_sd_m, _SMALL_FORCE_N)
+        force_n = min(micro.spring_n_per_m * 0.5 * profile.backlash.width_sd_m, _SMALL_FORCE_N)
     return Doubts(micro.mass_sd_kg, ratio * micro.spring_n_per_m, ratio * micro.damping_n_s_per_m, force_n=force_n)
 
 

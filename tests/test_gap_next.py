@@ -9,7 +9,6 @@ import pytest
 from typer.testing import CliRunner
 
 from stagectl import cli
-from stagectl.commands.gap_next import allowed
 from stagectl.commands.opening import home_and_arm
 from stagectl.errors import RequestError
 from stagectl.gap import moves, next_move, prediction
@@ -19,6 +18,7 @@ from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import log_of_rows, read_log
 from stagectl.gap.planned import planned_log
 from stagectl.gap.predicted_columns import observed, prepared
+from stagectl.motion import check
 from stagectl.profile import load_profile
 from stagectl.record import read_run
 from stagectl.stage import open_stage
@@ -68,7 +68,7 @@ def stage(tmp_path_factory):
     text = Path("profiles/single-axis.toml").read_text().split("[[effects]]")[0]
     file.write_text(text.replace("mass_kg = 12.0\n", f"mass_kg = {12.12 / FORCE_RATIO:.5g}\n") + KNOWN)
     profile = load_profile(file)
-    library = {m.name: m for m in moves.library(moves.room_of(profile), lambda planned: allowed(profile, planned))}
+    library = {m.name: m for m in moves.library(moves.room_of(profile), lambda planned: check(planned, profile))}
 
     def record(name: str, seed: int = 3):
         with open_stage(

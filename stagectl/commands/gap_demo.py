@@ -12,7 +12,7 @@ from rich.table import Table
 from stagectl import toml_file
 from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
 from stagectl.commands.gap import PAGE
-from stagectl.commands.gap_next import allowed, judged_table, perform
+from stagectl.commands.gap_next import judged_table, perform
 from stagectl.commands.opening import home_and_arm
 from stagectl.errors import DriveError
 from stagectl.gap import demo_page, findings_page, hiding, moves, next_move, prediction, residual
@@ -27,6 +27,7 @@ from stagectl.gap.prediction import with_outcomes
 from stagectl.gap.prediction_file import OUTCOME, PREDICTION, write_outcome, write_prediction
 from stagectl.gap.residual import Residual
 from stagectl.gap.workflow import find
+from stagectl.motion import check
 from stagectl.profile import Profile, load_profile, search_folders
 from stagectl.record import read_run
 from stagectl.run_folder import reserve
@@ -115,7 +116,7 @@ def show(voice: Voice, profile: str, runs_root: Path, seed: int) -> Answer:
     rig = _Rig(believed_profile, machine, folder, voice, seed)
     believed = believed_of_profile(believed_profile)
     room = moves.room_of(believed_profile)
-    candidates = moves.library(room, lambda planned: allowed(believed_profile, planned))
+    candidates = moves.library(room, lambda planned: check(planned, believed_profile))
     by_name = {move.name: move for move in candidates}
     voice.note("recording: one effect of the machine is not in the profile")
     training = [_log(rig.follows(by_name[name])[0], believed.period_s, believed) for name in TRAINING]

@@ -9,7 +9,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from stagectl import trajectory as trajectories
+from stagectl import motion
 from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
 from stagectl.commands.opening import home_and_arm, opened, place
 from stagectl.commands.runs import folder_of
@@ -26,7 +26,6 @@ from stagectl.gap.prediction_file import OUTCOME, PREDICTION, write_outcome, wri
 from stagectl.profile import Profile, load_profile
 from stagectl.record import read_manifest, read_run
 from stagectl.supervisor import Supervisor
-from stagectl.trajectory import Trajectory
 
 Stage = Callable[[], AbstractContextManager[Supervisor]]
 """Opens a connected stage for one motion."""
@@ -120,19 +119,7 @@ def _library(name: str, believed: Believed, logs: Sequence[Log]) -> list[Move]:
         profile = load_profile(name)
     except ProfileError:
         return moves.library(moves.room_of_motion([log.macro_position_m for log in logs], believed.period_s))
-    return moves.library(moves.room_of(profile), lambda planned: allowed(profile, planned))
-
-
-def allowed(profile: Profile, planned: Trajectory) -> None:
-    """Refuse a motion that the profile does not allow. Errors: RequestError."""
-    macro = profile.macro
-    trajectories.check(
-        planned,
-        macro.travel_m,
-        macro.velocity_limit_m_per_s,
-        macro.acceleration_limit_m_per_s2,
-        stop_deceleration_m_per_s2=macro.stop_deceleration_m_per_s2,
-    )
+    return moves.library(moves.room_of(profile), lambda planned: motion.check(planned, profile))
 
 
 def _now() -> str:
