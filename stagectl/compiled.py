@@ -1,14 +1,12 @@
-"""The one way to compile: numba, cached under a hash of every source that can reach the tick.
+"""The one way to compile: numba, cached under a hash of every source that compiled code can depend on.
 
 Numba rebuilds a cached function when its own file changes, not when a callee in another file does
 (measured: a loop kept 0.01 after its callee went to 0.02), so each version of the sources gets a
 cache folder of its own.
 """
 
-import hashlib
 import os
 import stat
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,18 +14,9 @@ from typing import Any, TypeVar, cast
 
 import numba
 
+from stagectl import sources
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])  # compiled, it is called as before
-_PACKAGES = ("stagectl", "sim_backend", "drivers")
-
-
-def _sources_hash() -> str:
-    """Hash all Python sources of the three packages, the interpreter and the compiler."""
-    root = Path(__file__).resolve().parent.parent
-    digest = hashlib.sha256(f"{sys.version} numba {numba.__version__}".encode())
-    for package in _PACKAGES:
-        for path in sorted((root / package).rglob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def _cache_root() -> Path:
@@ -69,7 +58,7 @@ def _own_temporary_folder() -> Path:
     return folder
 
 
-CACHE_FOLDER, CACHE_REMARK = _cache_folder(_sources_hash())
+CACHE_FOLDER, CACHE_REMARK = _cache_folder(sources.compiled_version())
 """Holds the compiled code and the generated modules of these sources; and why it is not the usual one, or empty."""
 
 numba.config.CACHE_DIR = str(CACHE_FOLDER / "numba")  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from stagectl import batch, cli, trajectory
+from stagectl import batch, trajectory
 from stagectl.budget import budget, measured, shares
 from stagectl.budget.disturbances import COGGING, CONTACT, DELAY, FORCE, MODEL, SENSOR, STEP, forces_missing, noises_of
 from stagectl.budget.measured import Stretch
@@ -14,6 +14,7 @@ from stagectl.budget.page import report
 from stagectl.errors import RequestError
 from stagectl.linear_loop import machine_body
 from stagectl.signals import SETPOINT
+from tests.command import call
 from tests.stage import followed, simulated, true_error_m, with_values
 
 
@@ -135,13 +136,6 @@ def test_an_unstable_loop_has_no_budget(oled_profile, oled_machine):
     wild = with_values(oled_profile, control__micro_bandwidth_hz=400.0)
     with pytest.raises(RequestError, match=r"loop is unstable .* lower control\.micro_bandwidth_hz"):
         shares.total_rms_m(wild, "dsmc", noises_of(wild, oled_machine), machine_body(oled_machine))
-
-
-def call(capsys, *arguments) -> tuple[int, str, str]:
-    capsys.readouterr()
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err
 
 
 def test_the_command_on_a_run(capsys, tmp_path):

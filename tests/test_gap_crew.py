@@ -17,8 +17,6 @@ from stagectl.gap.workflow import find, find_many
 from tests.blind import generate
 from tests.hill_in_the_guide import HILL, HILL_AXIS, hill_log
 
-pytestmark = pytest.mark.real_time
-
 SEED, DURATION_S = 117, 1.5  # two axes that touch; one sensor reads late, which moves the joint
 LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
 

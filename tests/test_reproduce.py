@@ -7,19 +7,12 @@ import re
 import pytest
 
 from bench import paper as bench_paper
-from stagectl import cli
 from stagectl.errors import RequestError
 from stagectl.paper.chapters import CHAPTERS, asked, work_through
 from stagectl.paper.page import COLUMNS, page
 from stagectl.paper.rows import Chapter, Row
 from stagectl.report import Quantity
-
-
-def call(capsys, *arguments) -> tuple[int, str, str]:
-    capsys.readouterr()
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err
+from tests.command import call
 
 
 def test_a_section_is_asked_for_by_name_or_by_number():

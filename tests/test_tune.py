@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from stagectl import cli, trajectory
+from stagectl import trajectory
 from stagectl.errors import ProfileError, RequestError
 from stagectl.linear_loop import GAP, LEFT, RIGHT, believed_body, linearise
 from stagectl.margins import margins
@@ -14,16 +14,10 @@ from stagectl.signals import Stop
 from stagectl.tuning.page import verdict
 from stagectl.tuning.patch import patched
 from stagectl.tuning.rules import Asked, tuned
+from tests.command import call
 from tests.stage import followed, rms, true_error_m, with_values
 
 MOVE = trajectory.trapezoid(0.2, 0.2, dwell_s=1.0, lead_s=0.2).setpoints
-
-
-def call(capsys, *arguments) -> tuple[int, str, str]:
-    capsys.readouterr()
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from typing import Any, Protocol, Self, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
-from stagectl.compiled import CACHE_FOLDER
+from stagectl import sources
 from stagectl.errors import LinkError, RequestError
 
 Item = TypeVar("Item")
@@ -146,7 +146,7 @@ class Dask:
                 f"`dask worker {self._address}`"
             ) from error
         try:
-            versions: Any = self._client.run(_version)
+            versions: Any = self._client.run(sources.version)
         except self._failures as error:
             raise self._lost(error) from error
         except ImportError as error:
@@ -155,7 +155,7 @@ class Dask:
                 "with the same stagectl as here"
             ) from error
         for worker, version in versions.items():
-            if version != _version():
+            if version != sources.version():
                 raise LinkError(_other_version(f"--dask {self._address}: worker {worker}", version))
 
     def _lost(self, error: BaseException) -> LinkError:
@@ -174,7 +174,8 @@ class Dask:
         try:
             lent = [self._travelled(value) for value in shared]
             waiting = [
-                self._client.submit(_worked, _version(), task, *lent, item, pure=False, retries=1) for item in items
+                self._client.submit(_worked, sources.version(), task, *lent, item, pure=False, retries=1)
+                for item in items
             ]
             return self._client.gather(waiting)  # pyright: ignore[reportReturnType]
         except self._failures as error:
@@ -217,18 +218,14 @@ def _failures() -> tuple[type[BaseException], ...]:
     return KilledWorker, CommClosedError, Cancelled, CancelledError, TimeoutError, OSError
 
 
-def _version() -> str:
-    """Return the hash of the sources that run here."""
-    return CACHE_FOLDER.name
-
-
 def _other_version(who: str, version: str) -> str:
-    return f"{who} has another stagectl (sources {version}, here {_version()}); install the same one on every worker"
+    here = sources.version()
+    return f"{who} has another stagectl (sources {version}, here {here}); install the same one on every worker"
 
 
 def _worked(version: str, task: Callable[..., Result], *arguments: Any) -> Result:
     """Do a task on a worker, which may have joined after the others were looked at."""
-    if version != _version():
+    if version != sources.version():
         raise LinkError(_other_version("a worker that joined later", version))
     with one_blas_thread():
         return task(*arguments)
