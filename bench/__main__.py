@@ -15,6 +15,8 @@ from pathlib import Path
 
 from bench.figure import Figure
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does; before numpy is loaded
+
 NAMES = ("gap", "main_job", "paper", "service")
 
 

@@ -1,6 +1,7 @@
 """The command line: arguments and help, nothing else. What a command does stands in `stagectl.commands`."""
 
 import io
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +18,10 @@ from stagectl.commands.service_arguments import InPlace, LeaseToken, Socket, ser
 
 if TYPE_CHECKING:
     from stagectl.commands.answer import Answer, Voice
+
+# Our matrices are small: more threads for them take turns at waiting (a bound of `budget`: 2.3 x the processor's time).
+# Said before numpy is loaded; for the processes that a command starts as well.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
     name="stagectl",

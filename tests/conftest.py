@@ -1,9 +1,12 @@
 """Shipped profiles and machines, read once."""
 
+import os
 import signal
 
 import pytest
 from hypothesis import settings
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does; before numpy is loaded
 
 from sim_backend.machine import load_machine
 from stagectl.profile import load_profile

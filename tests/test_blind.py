@@ -72,10 +72,10 @@ def test_two_bodies_on_a_spring_keep_energy_and_momentum():
     samples, cells, _ = free(20_000, relative_m=1e-3, spring_stiffness_n_per_m=500.0)
     t = np.arange(20_000) * SAMPLE_S
     w = math.sqrt(500.0 / (70.0 * 40.0 / 110.0))
-    assert samples[:, 7] - samples[:, 6] == pytest.approx(1e-3 * np.cos(w * t), abs=1e-8)
-    assert 70.0 * cells[:, 1] + 40.0 * cells[:, 3] == pytest.approx(np.zeros(len(cells)), abs=1e-12)
+    assert np.max(np.abs(samples[:, 7] - samples[:, 6] - 1e-3 * np.cos(w * t))) < 1e-8
+    assert np.max(np.abs(70.0 * cells[:, 1] + 40.0 * cells[:, 3])) < 1e-12
     energy = 35.0 * cells[:, 1] ** 2 + 20.0 * cells[:, 3] ** 2 + 250.0 * (cells[:, 2] - cells[:, 0]) ** 2
-    assert energy == pytest.approx(np.full(len(cells), 250e-6), rel=1e-5)
+    assert np.max(np.abs(energy / 250e-6 - 1.0)) < 1e-5
 
 
 def test_a_bounce_between_the_stops_keeps_energy_without_a_damper():
@@ -89,7 +89,7 @@ def test_a_bounce_between_the_stops_keeps_energy_without_a_damper():
     )
     r = samples[:, 7] - samples[:, 6]
     assert r.min() == pytest.approx(-25e-6 - 124e-6 * math.sqrt(9.87 / 13.2), abs=1e-7)  # the same energy on the left
-    assert 70.0 * cells[:, 1] + 40.0 * cells[:, 3] == pytest.approx(np.zeros(len(cells)), abs=1e-12)
+    assert np.max(np.abs(70.0 * cells[:, 1] + 40.0 * cells[:, 3])) < 1e-12
 
 
 def test_stops_at_rest_carry_the_force():
