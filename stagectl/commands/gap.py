@@ -15,12 +15,13 @@ from stagectl.commands.new_profile import refuse_place, text_of, write_checked
 from stagectl.commands.runs import folder_of
 from stagectl.errors import RequestError
 from stagectl.gap import addition, arbiter, findings_page, residual
-from stagectl.gap.application import Application, Change, application
+from stagectl.gap.application import Application, application
 from stagectl.gap.believed import Believed, document_of, load_believed
 from stagectl.gap.crew import Dask, crew_of
 from stagectl.gap.findings import Findings, Named
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import Log, read_log
+from stagectl.gap.profile_sheet import Change
 from stagectl.gap.workflow import find
 from stagectl.profile import search_folders
 
