@@ -13,7 +13,7 @@ from stagectl.profile import load_profile
 from stagectl.signals import Stop
 from stagectl.tuning.page import verdict
 from stagectl.tuning.patch import patched
-from stagectl.tuning.rules import MOVING, Asked, tuned
+from stagectl.tuning.rules import MOVING, Asked, assessed, tuned
 from tests.command import call
 from tests.stage import followed, rms, true_error_m, with_values
 
@@ -142,3 +142,12 @@ def test_dry_friction_is_no_damping_to_live_on(single_profile):
 
 def _control(values: dict[str, float]) -> dict[str, float]:
     return {f"control__{name}": value for name, value in values.items()}
+
+
+@pytest.mark.parametrize("name", ["oled-printer", "oled-printer-umd2", "kang-2023", "single-axis"])
+def test_shipped_gains_keep_the_margins_of_the_rules(name):
+    profile = load_profile(name)
+    found = assessed(profile, profile.control.law)
+    assert found.worst_sensitivity <= 2.0
+    assert found.least_delay_margin_s >= 0.8e-3
+    assert found.stable_with_other_mass
