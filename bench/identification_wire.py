@@ -16,7 +16,7 @@ from sim_backend.machine import load_machine
 from stagectl.profile import load_profile
 
 COVERED = Bar("identification over the wire, 100 nm: 95 % intervals that hold the truth, of edges and stiffness", "%")
-PULL = Bar("the same: error over its stated standard deviation, rms", "1", 1.3)
+PULL = Bar("the same: error over its stated standard deviation, rms", "1")
 WORST = Bar("the same: worst error over its stated standard deviation", "1")
 EDGE = Bar("the same: worst edge", "um", 0.5)
 
