@@ -28,7 +28,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="write what is printed to this file as well")
     parser.add_argument("--markdown", type=Path, help="write the table with date and host load to this file")
     parser.add_argument("--seed", type=int, help="service: play one run of the batch campaign again")
-    parser.add_argument("--part", help="service: do only this part")
+    parser.add_argument("--part", help="service, paper: do only this part")
     return parser.parse_args(argv)
 
 

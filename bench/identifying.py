@@ -25,6 +25,7 @@ class Identified:
     width_share: float
     left_edge_m: float  # magnitudes, in the run's own zero
     right_edge_m: float
+    pulls: tuple[float, float, float, float]  # edges, stiffnesses, left first: error over its stated deviation
 
     @property
     def stiffness_share(self) -> float:
@@ -64,6 +65,12 @@ def identify(
     shift_m = float(
         np.mean(scored.true_macro_minus_end_m - (truth["macro_position_m"] - truth["end_position_m"])[place])
     )
+    pulls = (
+        (found.left_m - (joint.left_m - shift_m)) / found.left_sd_m,
+        (found.right_m - (joint.right_m + shift_m)) / found.right_sd_m,
+        (found.left_stiffness_n_per_m - joint.left_stiffness_n_per_m) / found.left_stiffness_sd_n_per_m,
+        (found.right_stiffness_n_per_m - joint.right_stiffness_n_per_m) / found.right_stiffness_sd_n_per_m,
+    )
     return Identified(
         seed=seed,
         frequency_hz=frequency_hz,
@@ -72,4 +79,5 @@ def identify(
         width_share=abs(found.width_m / (joint.left_m + joint.right_m) - 1.0),
         left_edge_m=abs(found.left_m - (joint.left_m - shift_m)),
         right_edge_m=abs(found.right_m - (joint.right_m + shift_m)),
+        pulls=pulls,
     )

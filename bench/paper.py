@@ -14,7 +14,16 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from bench import ablation, adaptive_drift, control_disturbed, control_limit, identification_limit, learning, limits
+from bench import (
+    ablation,
+    adaptive_drift,
+    control_disturbed,
+    control_limit,
+    identification_limit,
+    identification_wire,
+    learning,
+    limits,
+)
 from bench.figure import Bar, Figure, judged
 from stagectl.paper import gated, identification_test, recursive_least_squares, rig_chapter
 from stagectl.paper.chapters import CHAPTERS, work_through
@@ -51,17 +60,28 @@ _NOISE_M = 100e-9
 Say = Callable[[str], None]
 
 
-def figures(*, full: bool, say: Say) -> Iterator[Figure]:
-    """Measure every row."""
-    say("from nothing")
-    yield _cold()
+def figures(*, full: bool, say: Say, part: str | None = None) -> Iterator[Figure]:
+    """Measure every row, or those of one part."""
+    if part is not None and part not in PARTS:
+        raise SystemExit(f"bench paper --part {part}: choose from {', '.join(PARTS)}")
+    for name, measure in PARTS.items():
+        if part in (None, name):
+            begin_s = time.monotonic()
+            say(name)
+            yield from measure(full=full, say=say)
+            say(f"{name}: {time.monotonic() - begin_s:.0f} s")
+
+
+def _paper_tests(*, full: bool, say: Say) -> Iterator[Figure]:
+    """Identify on the paper's own tests; `full` changes nothing: the seeds are those of the bars."""
     samples = identification_test.run(identification_test.platform(), 60.0)
     say("identification")
     yield from _table_2(samples)
     yield from _rig()
     yield from _costs(samples)
-    for part in (identification_limit, control_limit, control_disturbed, adaptive_drift, limits, ablation, learning):
-        yield from part.figures(full=full, say=say)
+
+
+def _chapters(*, full: bool, say: Say) -> Iterator[Figure]:
     for chapter in work_through(tuple(CHAPTERS), lambda what, _: say(what)):
         yield from figures_of(chapter)
 
@@ -78,7 +98,7 @@ def figures_of(chapter: Chapter) -> Iterator[Figure]:
                 yield judged(bar, value * scale, reason=said)
 
 
-def _cold() -> Figure:
+def _cold(*, full: bool, say: Say) -> Iterator[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         begin_s = time.monotonic()
         subprocess.run(
@@ -87,7 +107,7 @@ def _cold() -> Figure:
             capture_output=True,
             env=os.environ | {"STAGECTL_CACHE": f"{folder}/cache"},
         )
-        return judged(COLD, time.monotonic() - begin_s, reason=f"{os.cpu_count()} processors")
+        yield judged(COLD, time.monotonic() - begin_s, reason=f"{os.cpu_count()} processors")
 
 
 def _noisy(samples: Samples, seed: int) -> gated.Gated:
@@ -144,3 +164,19 @@ def _costs(samples: Samples) -> Iterator[Figure]:
 
     for bar, work in ((COST, ours), (PAPER_COST, theirs)):
         yield identification_limit.cost(bar, work, samples.t_s.size)
+
+
+PARTS: dict[str, Callable[..., Iterator[Figure]]] = {
+    "cold": _cold,
+    "identification": _paper_tests,
+    "identification-limit": identification_limit.figures,
+    "identification-wire": identification_wire.figures,
+    "control": control_limit.figures,
+    "disturbed": control_disturbed.figures,
+    "adaptive-drift": adaptive_drift.figures,
+    "bounds": limits.figures,
+    "ablation": ablation.figures,
+    "learning": learning.figures,
+    "chapters": _chapters,
+}
+"""By the name that `--part` takes."""

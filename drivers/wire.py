@@ -309,6 +309,7 @@ class WireDecoder:
         be what was agreed, else an empty text.
         """
         text = ""
+        last_cycle = self.cycle
         self._take_bytes(inbox)
         valid = self._valid_count
         self._taken_bytes_count = self._valid_count = 0
@@ -319,10 +320,14 @@ class WireDecoder:
         seen.t_ns = inbox.t_ns
         seen.samples_new = valid
         seen.sequence = self.sequence
+        seen.latched_after_s = 0.0
         if self.sequence >= 0:
             seen.sample_t_ns, age_ns = sample_clock.sample_at(self.clock, self.sequence, inbox.t_ns)
             due = self.sequence + math.floor((age_ns - self._earliest_ns) / self.period_ns)
             self.cycle = max(due, self.cycle + 1 if valid and self.cycle < 0 else self.cycle, self.sequence)
+            if last_cycle >= 0 and inbox.sync_t_ns:
+                sample_t_ns = seen.sample_t_ns - (self.sequence - last_cycle) * self.period_ns
+                seen.latched_after_s = 1e-9 * (inbox.sync_t_ns - sample_t_ns)
             self._follow_air()
             seen.macro_position_m = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
             seen.end_position_m = (self.end_counts - self.end_zero_counts) * self.end_m_per_count

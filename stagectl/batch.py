@@ -36,6 +36,7 @@ DEVICES = np.dtype(
         ("sampled_s", "f8"),  # instant of the last sample, for what the sensors remember
         ("mean_from_s", "f8"),  # instant of the last sample, and the end's position integral there
         ("mean_from_m_s", "f8"),
+        ("latched_after_s", "f8"),  # last sample instant -> its SYNC, as it came; 0 = none yet
         ("late_sample", "f8"),  # whose line comes a cycle late; -1 = none
         ("late_t_s", "f8"),
         ("late_macro_m", "f8"),
@@ -84,6 +85,7 @@ def run(setpoints, noise_m, late, instants_s, devices, state, parameters, machin
         m.cycle = int(d.sample)
         m.t_ns = int(latch_s * 1e9)
         m.lease_left_ns = 1000000000
+        m.latched_after_s = d.latched_after_s
         macro_m = s.macro_position_m + macro_error_m + noise_m[k, 0] - d.macro_origin_m
         end_m = s.end_position_m + end_error_m + noise_m[k, 1] - d.end_origin_m
         macro_step_m = d.macro_resolution_m
@@ -123,6 +125,7 @@ def run(setpoints, noise_m, late, instants_s, devices, state, parameters, machin
         backlashes[k, 3] = b[0].right_stiffness_n_per_m
         plant_module.advance(state, parameters, machine_effects, latch_s, d.longest_substep_s,
                              d.macro_a, d.micro_a, 1, 1)
+        d.latched_after_s = latch_s - t_s
         d.macro_a = c.macro_word * d.macro_amperes_per_word
         d.micro_a = c.micro_word * d.micro_amperes_per_word
         d.sample += 1.0

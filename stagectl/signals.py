@@ -50,6 +50,7 @@ MEASUREMENT = np.dtype(
         ("tpdos_new", "i8"),  # bit 0 macro, bit 1 micro: a TPDO of the last SYNC arrived
         ("emergency", "i8"),  # last EMCY: node id << 16 | error code; 0 = none
         ("command_lost", "i8"),  # 1 when the last cycle's command could not be put on the bus
+        ("latched_after_s", "f8"),  # last cycle's sample instant to the end of its SYNC, measured; 0 = not known
         ("lease_left_ns", "i8"),  # time until the motion lease ends; the guard stops at <= 0
         ("overrun_ns", "i8"),  # lateness of this cycle beyond one period, else 0
     ]

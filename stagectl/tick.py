@@ -69,8 +69,10 @@ def estimate(m, e, model, ahead, b, q, p):
                 x.end_seen_m = s.end_position_m
             if q[0].has_micro != 0.0 and periods + x.predicted_samples <= x.bridged_samples_max:
                 # A line that comes late is one in twenty: its place is filled by what was predicted (a few nm off).
+                # Stuff bits move the end of SYNC with the word's own bits: a microsecond is 2 mN, and no noise.
+                latched_s = m.latched_after_s if k == 0 and m.latched_after_s > 0.0 else x.actuation_delay_s
                 mean_n = backlash.motor_mean_force(b[0], q[0], x.micro_word_before, x.micro_word,
-                                                   x.micro_amperes_per_word, x.actuation_delay_s)
+                                                   x.micro_amperes_per_word, min(latched_s, x.period_s))
                 relative_m = x.end_seen_m - x.macro_seen_m
                 rate = s.end_velocity_m_per_s - s.macro_velocity_m_per_s
                 mean_n += forces.micro_actuator(x.end_seen_m, s.end_velocity_m_per_s, s.end_acceleration_m_per_s2,

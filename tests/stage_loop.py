@@ -69,6 +69,7 @@ class Loop:
         m["cycle"] = int(d["sample"])
         m["t_ns"] = int((t_s + d["latch_delay_s"]) * 1e9)
         m["lease_left_ns"] = 1_000_000_000
+        m["latched_after_s"] = d["latched_after_s"]
         m["samples_new"] = 0
         this = (int(d["sample"]), int(t_s * 1e9), *seen)
         fresh = fresh and not silent
@@ -83,6 +84,7 @@ class Loop:
         one.controller.step()
         m["command_lost"] = int(lost)  # known when the next cycle begins
         self._advance(t_s + d["latch_delay_s"])
+        d["latched_after_s"] = (t_s + d["latch_delay_s"]) - t_s
         if not lost:
             d["macro_a"] = c["macro_word"][0] * d["macro_amperes_per_word"]
             d["micro_a"] = c["micro_word"][0] * d["micro_amperes_per_word"]

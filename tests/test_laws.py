@@ -401,9 +401,9 @@ def test_oled_printer_sine(oled_profile, oled_machine):
 @pytest.mark.parametrize(
     ("name", "law", "peak_m", "hold_m"),
     [
-        ("kang-2023", "dsmc", (15e-9, 60e-9), (3e-9, 12e-9)),  # paper: [-22, 18] um
+        ("kang-2023", "dsmc", (8e-9, 30e-9), (2e-9, 8e-9)),  # paper: [-22, 18] um
         ("kang-2023", "pid", (25e-9, 100e-9), (3e-9, 12e-9)),  # paper: [-12, 11] mm with a weak micro
-        ("oled-printer-umd2", "dsmc", (60e-9, 250e-9), (2e-9, 12e-9)),  # 79 nm a count above 10 um/s
+        ("oled-printer-umd2", "dsmc", (50e-9, 180e-9), (2e-9, 8e-9)),  # 79 nm a count above 10 um/s
         ("oled-printer-umd2", "pid", (120e-9, 500e-9), (2e-9, 12e-9)),
     ],
 )

@@ -132,3 +132,26 @@ def test_where_no_position_is_the_index_is_there_at_once():
     lines.hear(3, 2100)
     assert lines.hear(3, 2100) == 0.0
     assert lines.decoder.air_index == ciddor_index(HENE_M, 21.0, 101325.0, 50.0, 450.0)
+
+
+def test_when_the_last_command_was_latched_is_told_from_its_own_sample():
+    """Lines at 150 us, SYNCs 600 us behind the samples and a little more each: late lines and none change nothing."""
+    decoder = WireDecoder(load_profile("oled-printer-umd2"), {})
+    seen = fields(new(MEASUREMENT))
+    inbox = Inbox()
+    told, meant = [], []
+    for number in range(3000):
+        late, lost = number % 7 == 3, number % 31 == 30
+        inbox.clear()
+        sample_t_ns = 10**9 + number * MS
+        inbox.t_ns = sample_t_ns + 400_000
+        if number % 7 == 4:
+            inbox.add_sensor_bytes(LINE % (COUNTS, number - 1, 0, 0, -COUNTS // 2), sample_t_ns - 100_000)
+        if not late and not lost:
+            inbox.add_sensor_bytes(LINE % (COUNTS, number, 0, 0, -COUNTS // 2), sample_t_ns + 150_000)
+        assert decoder.decode(inbox, seen) == ""
+        told.append(seen.latched_after_s)
+        meant.append(1e-9 * (inbox.sync_t_ns - sample_t_ns + MS) if number else 0.0)
+        inbox.sync_t_ns = sample_t_ns + 600_000 + 50 * (number % 90)
+    assert told[0] == 0.0
+    assert np.max(np.abs(np.array(told[2000:]) - meant[2000:])) < 0.2e-6

@@ -8,12 +8,14 @@ one number, w: it is made as large as the margins allow, the adaptive gain at it
 that is asked for takes. PID has its bandwidth as that one number. A flexible mode that is known gets a notch
 (`stagectl.tuning.mode`), and the bandwidth that the notch leaves.
 
-Every result is checked in the gap and in contact on either side, and with the moved mass 10 % off.
+Every result is checked in the gap and in contact on either side, in motion where there is dry friction, and with the
+moved mass 10 % off.
 """
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -22,6 +24,7 @@ import numpy as np
 from stagectl.budget import shares
 from stagectl.budget.budget import STEP_N
 from stagectl.budget.disturbances import noises_of
+from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
 from stagectl.linear_loop import GAP, LEFT, RIGHT, Body, Linearised, believed_body, linearise
 from stagectl.margins import Margins, grid_hz, margins
@@ -34,6 +37,8 @@ if TYPE_CHECKING:
 PLACES = {GAP: "gap", LEFT: "left contact", RIGHT: "right contact"}
 CEILING = "gap, adapted"
 """With the adaptive gain at its ceiling."""
+MOVING = "in motion"
+"""In the gap, at a speed at which dry friction is a force that damps nothing."""
 MASS_RATIO = 0.1
 
 _SLIDING_RATIO, _ETA_RATIO = (
@@ -92,8 +97,8 @@ class Assessment:
 
     @property
     def crossover_hz(self) -> float:
-        """Crossover in the gap."""
-        return self.loops[0].margins.crossover_hz
+        """Crossover in the gap; in motion where dry friction holds the stage at rest."""
+        return next((one for one in self.loops if one.place == MOVING), self.loops[0]).margins.crossover_hz
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,6 +182,10 @@ def assessed(profile: "Profile", law: str, mode: Mode | None = None) -> Assessme
         one = linearise(profile, law, body, place)
         loops.append(Loop(said, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
     most = most_adaptive_gain_ratio(profile, law)
+    moving = _in_motion(profile)
+    if moving is not None:
+        one = linearise(moving, law, believed_body(moving), GAP, most)
+        loops.append(Loop(MOVING, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
     if most:
         one = linearise(profile, law, body, GAP, most)
         loops.append(Loop(CEILING, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
@@ -187,8 +196,22 @@ def assessed(profile: "Profile", law: str, mode: Mode | None = None) -> Assessme
     if loops[0].margins.is_stable:
         hold_m = shares.total_rms_m(profile, law, noises_of(profile), body)
         peak_m = step_peak_m(in_gap)
-    stable = all(linearise(profile, law, _heavier(body, profile, ratio)).closed().is_stable() for ratio in _OFF)
+    stable = all(
+        linearise(one, law, _heavier(believed_body(one), one, ratio)).closed().is_stable()
+        for one in (profile, moving)
+        if one is not None
+        for ratio in _OFF
+    )
     return Assessment(tuple(loops), hold_m, peak_m, stable)
+
+
+def _in_motion(profile: "Profile") -> "Profile | None":
+    """Return the profile without its dry friction; None where it has none.
+
+    At rest 6 N within 1 mm/s are 6000 N s/m of damping, and a loop that lives on them is without them once it moves.
+    """
+    rows = tuple(row for row in profile.effects if CATALOGUE[row["name"]].shown_by != "low speed")
+    return None if len(rows) == len(profile.effects) else profile.model_copy(update={"effects": rows})
 
 
 def _loops_with(one: Linearised, mode: Mode) -> list[Loop]:
@@ -265,18 +288,19 @@ def _with(
 def _searched(profile: "Profile", law: str, key: str, asked: Asked) -> float:
     """Return the greatest value that keeps the margins in the gap, or the one that has the bandwidth asked for."""
     now = getattr(profile.control, key)
-    body = believed_body(profile)
+    looked_at = [(one, believed_body(one)) for one in (_in_motion(profile), profile) if one is not None]
 
     most = most_adaptive_gain_ratio(_with(profile, law, now), law) if asked.bandwidth_hz is None else 0.0
 
-    def found(value: float) -> Margins:
-        return margins(linearise(_with(profile, law, value), law, body, GAP, most))
+    def found(value: float, place: int = 0) -> Margins:
+        one, body = looked_at[place]
+        return margins(linearise(_with(one, law, value), law, body, GAP, most))
 
     def keeps(value: float) -> bool:
         one = found(value)
         if asked.bandwidth_hz is not None:
             return one.is_stable and one.crossover_hz <= asked.bandwidth_hz
-        return one.is_stable and _within(one, asked)
+        return all(one.is_stable and _within(one, asked) for one in map(partial(found, value), range(len(looked_at))))
 
     values = np.geomspace(_SPAN[0], _SPAN[1], _GRID_COUNT) * now
     kept = [k for k, value in enumerate(values) if keeps(float(value))]
