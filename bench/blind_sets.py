@@ -402,6 +402,9 @@ def summary_lines(all_marked: Sequence[Marked]) -> list[str]:
         )
     means = ("parameter_error_median", "coverage", "mean_set_size", "mean_own_set_size")
     lines += [f"{name.replace('_', ' ')}: {result[name]:.3g}" for name in means if result[name] is not None]
+    if result["coverage"] is not None:
+        low, high = result["coverage_interval"]
+        lines.append(f"coverage between {100 * low:.0f} and {100 * high:.0f} % by the number of its intervals")
     lines.append(f"reducible gap closed: {closed_text(all_marked)}")
     for name, row in result["by_name"].items():
         lines.append(

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from stagectl.effects import CATALOGUE
+from stagectl.gap import balance
+from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.command_path import PARTS_COUNT, changed_by, driven
+from stagectl.gap.hypotheses import deviation_term, parameter_terms
+from stagectl.gap.innovations import Noise
+from stagectl.gap.log import Log
+from stagectl.gap.operating_point import operating_point
 
 PERIOD_S = 1e-3
 COMMAND = np.cumsum(np.random.default_rng(3).standard_normal(400))
@@ -48,3 +54,45 @@ def test_a_dead_band_changes_the_commands_themselves():
     wanted = [a - b for a, b in zip(driven(commands, 0.57e-3, 0.15e-3, PERIOD_S), before, strict=True)]
     found = changed_by(CATALOGUE["amplifier_dead_band"], [2.0], COMMAND, 0.57e-3, 0.15e-3, PERIOD_S)
     assert near(found, wanted, 1e-12)
+
+
+LATCH_S, LAG_S, DELAY_S, CONSTANT_N_PER_A = 0.57e-3, 0.15e-3, 0.35e-3, 100.0
+AXIS = Believed(
+    "axis",
+    PERIOD_S,
+    BelievedAxis(
+        40.0, 0.4, 5e-9, LAG_S, force_constant_n_per_a=CONSTANT_N_PER_A, latch_s=LATCH_S, latch_sd_s=6e-6,
+        current_loop_sd_s=8e-6, current_noise_a=0.005,
+    ),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def under_a_delay():
+    """A drive that takes commands over 0.35 ms later than believed: as believed, and with that delay known."""
+    current_a = driven(COMMAND, LATCH_S + DELAY_S, LAG_S, PERIOD_S)[1] / CONSTANT_N_PER_A
+    position_m = 1e-4 * np.sin(np.arange(COMMAND.size) / 20.0)
+    log = Log("run", PERIOD_S, position_m, COMMAND, np.ones(COMMAND.size, bool), "1", macro_current_a=current_a)
+    believed = balance.recording_of(log, AXIS)
+    return believed, operating_point(believed, [(CATALOGUE["command_delay"], "macro_command", {"delay_s": DELAY_S})])
+
+
+def test_a_delay_that_is_known_is_in_the_currents_that_a_drive_should_report(under_a_delay):
+    noise = {"macro": Noise(5e-9, 0.05, 8.0, 0.0)}
+    left = []
+    for recording in under_a_delay:
+        balance.set_noise(recording, noise)
+        left.append(np.abs(balance.observed(recording)[-1][30:-30]).max())
+    assert left[0] > 1.0
+    assert left[1] < 1e-3 * left[0]
+
+
+def test_beside_a_delay_that_is_known_the_latch_is_the_same_column(under_a_delay):
+    """A latch is uncertain where the commands then are: elsewhere 6 us that nobody knows seemed known to 1 us."""
+    _, there = under_a_delay
+    latch = next(term for term, _ in parameter_terms(there) if term.name == "macro_latch_s").forces(there)[0]
+    term = deviation_term(CATALOGUE["command_delay"], "macro_command", {"delay_s": DELAY_S})
+    delay = term.forces(there)[0]
+    for one, other in ((latch.macro_n, delay.macro_n), (latch.macro_current_a, delay.macro_current_a)):
+        inner, wanted = one[30:-30], other[30:-30] / DELAY_S
+        assert np.linalg.norm(inner - wanted) < 0.05 * np.linalg.norm(wanted)

@@ -117,6 +117,39 @@ def test_the_planted_term_is_found_and_its_twin_is_an_alias():
     assert solve([*judge.base, chosen[0]], judge.training).of(chosen[0])[0][0] == pytest.approx(0.3, abs=0.03)
 
 
+@pytest.mark.parametrize(("wider", "is_alias"), [("cable_spring", True), ("stribeck_friction", False)])
+def test_a_law_about_a_place_is_no_wider_than_one_about_zero(wider, is_alias):
+    """A cable's anchor may be anywhere; a Stribeck friction has a number more than what it is a case of."""
+    judge = _judge(0.3)
+    place = "macro_force"
+    spring, other = Group(("linear_stiffness", place), (3,)), Group((wider, place), (4,), searched=1)
+    judge.library[1:3] = spring, other
+    assert ((wider, place) in [key for key, _ in judge.aliases([spring], spring)]) is is_alias
+
+
+def test_names_are_as_far_apart_as_what_they_say():
+    """Twins with a correlation of 0.999, 33 long: 33^2 (1 - 0.999^2) is 2; another term has nothing in common."""
+    judge = _judge(0.3)
+    other, one, twin = judge.library[:3]
+    assert judge.distance([one], [one]) == pytest.approx(0.0, abs=1e-6)
+    assert 0.5 < judge.distance([one], [twin]) < 8.0
+    assert judge.distance([one], [other]) == pytest.approx(0.09 * 3 * 4000, rel=0.15)
+
+
+def test_a_belief_that_fitting_made_worse_is_what_the_gap_is_counted_from():
+    """The known parameter looks like the hidden term in the runs of the fit, and like its opposite in the third."""
+    random = np.random.default_rng(5)
+    sums = []
+    for run, sign in enumerate((1.0, 1.0, -1.0)):
+        hidden = random.standard_normal(4000)
+        block = np.column_stack([random.standard_normal(4000) + 0.5 * hidden, sign * hidden])
+        sums.append(Sums(block.T @ block, 4000.0, str(run), str(run), np.zeros((1, 1))))
+    base = [Group(("base", "parameter"), (1,), prior_sds=(1.0,))]
+    judge = Judge(_Table(sums), 2, base, [], lambda _, groups: list(groups), lambda _, groups: [0.0] * len(groups))
+    assert judge.reducible([])[1] == pytest.approx(4000.0, rel=0.15)  # 4 x 0.25 x 4000: twice the amplitude
+    assert judge.reducible_before()[1] == pytest.approx(1000.0, rel=0.25)
+
+
 def test_on_noise_nothing_is_named():
     assert _judge(0.0).select() == []
 

@@ -42,6 +42,7 @@ def gravity_tilt(mass_kg, grade_ratio):
     linear=("stiffness_n_per_m",),
     session=("anchor_m",),
     searched=("anchor_m",),
+    traits=(Trait.PLACED,),
     shown_by="holds",
     symptom="linear in position",
     reference="Hooke; cable carriers of linear stages",

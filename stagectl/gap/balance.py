@@ -4,6 +4,8 @@ Forces of spring, damping and contact are taken on the measured relative positio
 bodies fall apart into one mass each: `stagectl.gap.innovations` whitens them one by one. Pure.
 """
 
+from typing import Any
+
 import numpy as np
 
 from stagectl.gap import innovations
@@ -24,9 +26,13 @@ _ENDING_S = 0.01  # where a late sensor would still have read is not recorded
 _LOOSE_N = 1e3
 
 
-def recording_of(log: Log, believed: Believed) -> Recording:
-    """Prepare a log: motion, commands on parts of intervals, contact geometry."""
-    rough = put_together(log, believed, motion_of(log.macro_position_m, log.period_s, believed.macro.noise_m), None)
+def recording_of(log: Log, believed: Believed, on_command: tuple[dict[str, Any], ...] = ()) -> Recording:
+    """Prepare a log: motion, commands on parts of intervals, contact geometry.
+
+    on_command: effects of the command path that act beside what is believed, as rows of a profile.
+    """
+    macro = motion_of(log.macro_position_m, log.period_s, believed.macro.noise_m)
+    rough = put_together(log, believed, macro, None, on_command)
     return foretold_under(rough, known_forces(rough))
 
 
@@ -40,7 +46,7 @@ def foretold_under(recording: Recording, forces: Forces) -> Recording:
                 recording.motion(axis), recording.position_m(axis), log.valid, force_n, recording.mass_kg(axis),
                 log.period_s, recording.belief(axis).noise_m,
             )  # fmt: skip
-    return put_together(log, believed, motions[0] or recording.macro, motions[1])
+    return put_together(log, believed, motions[0] or recording.macro, motions[1], recording.on_command)
 
 
 def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = True) -> None:
@@ -91,7 +97,10 @@ def observed(recording: Recording) -> list[np.ndarray]:
         whitened(recording, axis, known.macro_n if axis == "macro" else known.end_n, recording.position_m(axis))
         for axis in recording.axes
     ]
-    return parts + [_scaled(recording, axis, reported_a) for axis, reported_a in recording.reported_a.items()]
+    for axis, reported_a in recording.reported_a.items():
+        known_a = known.macro_current_a if axis == "macro" else known.end_current_a
+        parts.append(_scaled(recording, axis, reported_a if known_a is None else reported_a - known_a))
+    return parts
 
 
 def unexplained(recording: Recording, forces: Forces) -> list[np.ndarray]:

@@ -21,7 +21,7 @@ def known_forces(recording: Recording) -> Forces:
         macro_n -= joint_n
         end_n += joint_n
     total = Forces(macro_n, end_n)
-    for row in recording.believed.effects:
+    for row in (*recording.believed.effects, *recording.on_command):
         effect = CATALOGUE[row["name"]]
         add_forces(total, effect_forces(recording, effect, row["acts_on"], [row[name] for name in effect.parameters]))
     return total

@@ -124,17 +124,38 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
 
 
 @compiled
-def filtered(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
-    """Return (known, foretold, spread, unlikely): what the filter knows along the samples, and how likely they are.
+def certainty(valid, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
+    """Return (gains (n, 4), innovation variances (n,), standard deviations of the known velocity, m/s, (n,)).
 
-    known: position, velocity and slow force with each sample, shape (n, 3); foretold: position and velocity before it,
-    (n, 2); spread: standard deviation of the known velocity, m/s, (n,); unlikely: minus twice the log-likelihood.
+    What a filter knows depends on which samples are valid, and on nothing that they hold.
+    """
+    n = valid.size
+    a, drive, p = _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)
+    gains_here, variances, spread_m_per_s = np.zeros((n, _STATES)), np.zeros(n), np.zeros(n)
+    for k in range(n):
+        if valid[k]:
+            variance = p[0, 0] + sensor_m * sensor_m
+            gain = p[:, 0] / variance
+            p = p - np.outer(gain, p[0])
+            gains_here[k] = gain
+            variances[k] = variance
+        spread_m_per_s[k] = np.sqrt(p[1, 1])
+        p = a @ p @ a.T + drive
+        p = 0.5 * (p + p.T)
+    return gains_here, variances, spread_m_per_s
+
+
+@compiled
+def filtered(position_m, valid, mean_n, early_n, gain, variance, mass_kg, period_s, corner_rad_per_s):
+    """Return (known, foretold, unlikely): what the filter knows along the samples, and how likely they are.
+
+    gain, variance: of `certainty`. known: position, velocity and slow force with each sample, shape (n, 3); foretold:
+    position and velocity before it, (n, 2); unlikely: minus twice the log-likelihood.
     """
     n = position_m.size
     h = period_s
-    a, drive, p = _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)
+    a, _, _ = _model(mass_kg, period_s, 0.0, 0.0, corner_rad_per_s)
     known, foretold = np.zeros((n, 3)), np.zeros((n, 2))
-    spread_m_per_s = np.zeros(n)
     unlikely = 0.0
     x = np.zeros(_STATES)
     x[0] = position_m[0]
@@ -142,20 +163,14 @@ def filtered(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, fo
     for k in range(n):
         foretold[k] = x[:2]
         if valid[k]:
-            variance = p[0, 0] + sensor_m * sensor_m
             z = position_m[k] - x[0]
-            unlikely += z * z / variance + np.log(variance)
-            gain = p[:, 0] / variance
-            x = x + gain * z
-            p = p - np.outer(gain, p[0])
+            unlikely += z * z / variance[k] + np.log(variance[k])
+            x = x + gain[k] * z
         known[k] = x[:3]
-        spread_m_per_s[k] = np.sqrt(p[1, 1])
         pull[0] = 0.5 * h * h * early_n[k] / mass_kg
         pull[1] = h * mean_n[k] / mass_kg
         x = a @ x + pull
-        p = a @ p @ a.T + drive
-        p = 0.5 * (p + p.T)
-    return known, foretold, spread_m_per_s, unlikely
+    return known, foretold, unlikely
 
 
 def moments(fine_n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,22 +7,19 @@ the second look. Pure.
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from stagectl.gap import balance
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Crew
-from stagectl.gap.effect_forces import known_forces
 from stagectl.gap.findings import Named
-from stagectl.gap.forces import sum_of_forces
 from stagectl.gap.innovations import Noise
+from stagectl.gap.known_motion import moved_under
 from stagectl.gap.left_over import excess, unknown_rest
 from stagectl.gap.naming import all_named
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group
 from stagectl.gap.recording import Recording
-from stagectl.gap.settling import moved_by, moves_joint, moves_readings, remeasured, settled, stands
+from stagectl.gap.settling import moves_joint, remeasured, stands
 
 _CLOSER_LOOKS = 2
-_FORETOLD_PASSES = 3  # a friction is known along a motion that knows of the friction
 
 
 class Look(NamedTuple):
@@ -76,26 +73,14 @@ def _under(
     crew: Crew,
 ) -> Competition:
     """Make the competition along the motion that `known` effects make, at the place where they put the joint."""
-    moving = [group for group in known if moves_readings(first, group)]
-    still = [group for group in known if group not in moving]
-    explained = first.explained(still)
-    first.evidence.forget_trials()
-    there, moved, kept = settled(
-        unsettled,
-        noise,
-        tuple(moved_by(first, known, group) for group in moving),
-        tuple(first.term(group) for group in still),
-        crew,
-    )
-    for _ in range(_FORETOLD_PASSES if still else 1):
-        there = crew.here(lambda r: balance.foretold_under(r, sum_of_forces(known_forces(r), explained(r))), there)
+    motion = moved_under(known, first, unsettled, noise, crew)
     search = Competition(
-        there,
+        motion.recordings,
         first.judge.training_count,
         without=without,
-        moved=moved,
-        kept=kept,
-        noise=noise_of(there, explained),
+        moved=motion.moved,
+        kept=motion.kept,
+        noise=noise_of(motion.recordings, motion.explained),
         crew=crew,
     )
     search.judge.threshold, search.judge.trace = first.judge.threshold, first.judge.trace

@@ -5,13 +5,14 @@ a step at reversal is taken on parts of an interval, and reversals and standstil
 Pure.
 """
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from stagectl.gap.command_path import PARTS_COUNT
-from stagectl.gap.innovations import filtered, moments
+from stagectl.gap.innovations import certainty, filtered, moments
 
 _WINDOW = 21
 _ORDER = 3
@@ -70,6 +71,9 @@ SLOW_CORNER_RAD_PER_S = 2.0 * np.pi * 1.34
 _DOUBTS = ((SLOW_FORCE_N, SLOW_CORNER_RAD_PER_S), *((0.05 * 4.0**k, 2.0 * np.pi * 20.0) for k in range(6)))
 """Slow forces (N, corner in rad/s) of which the likeliest stands for what the believed forces lack."""
 
+_KEPT_COUNT = 64
+"""Filters that are kept, 1 MB for 20 s: two bodies with two payloads in a few lengths of recording."""
+
 
 def motion_under(
     rough: Motion, position_m: np.ndarray, valid: np.ndarray, force_n: np.ndarray, mass_kg: float,
@@ -83,8 +87,14 @@ def motion_under(
     believed forces can be trusted is what makes the samples likeliest.
     """
     mean_n, early_n = moments(force_n)
-    tried = [filtered(position_m, valid, mean_n, early_n, mass_kg, period_s, sensor_m, *doubt) for doubt in _DOUBTS]
-    known, foretold, spread_m_per_s, _ = min(tried, key=lambda one: one[3])
+    samples = valid.tobytes()
+    tried = []
+    for doubt in _DOUBTS:
+        gain, variance, spread_m_per_s = _certainty(samples, mass_kg, period_s, sensor_m, *doubt)
+        corner_rad_per_s = doubt[1]
+        outcome = filtered(position_m, valid, mean_n, early_n, gain, variance, mass_kg, period_s, corner_rad_per_s)
+        tried.append((*outcome, spread_m_per_s))
+    known, foretold, _, spread_m_per_s = min(tried, key=lambda one: one[2])
     step_s = period_s / force_n.shape[1]
     acceleration = (force_n + known[:, 2:]) / mass_kg
     velocity = known[:, 1:2] + step_s * (np.cumsum(acceleration, axis=1) - 0.5 * acceleration)
@@ -95,3 +105,11 @@ def motion_under(
     unsure |= np.min(velocity, axis=1) * np.max(velocity, axis=1) <= 0.0  # where it turns round within the interval
     slow = rough.slow | (np.convolve(unsure, np.ones(3), "same") > 0.5)
     return Motion(position, velocity, acceleration, slow, at_samples)
+
+
+@functools.lru_cache(maxsize=_KEPT_COUNT)
+def _certainty(
+    samples: bytes, mass_kg: float, period_s: float, sensor_m: float, force_n: float, corner_rad_per_s: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what a filter knows along samples that are valid or not: the same each time a recording is looked at."""
+    return certainty(np.frombuffer(samples, dtype=bool), mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)

@@ -1,4 +1,4 @@
-"""Recordings with the joint and the readings put where effects have them. Pure."""
+"""Recordings with the joint, the readings and the motors' currents put where effects have them. Pure."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,22 +15,27 @@ from stagectl.gap.reading_errors import other_instants_s, reading_error_m
 from stagectl.gap.recording import Recording
 
 Moved = tuple[Effect, str, dict[str, float]]
-"""An effect that moves the joint's geometry or the readings, its place, its parameters."""
+"""An effect that moves the joint's geometry, the readings or what the drives make of commands: place, parameters."""
 
 
 _CORRECTIONS = 2
 
 
 def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
-    """Return a recording with sensor errors taken out of its positions and edges where effects have put them.
+    """Return a recording with sensor errors taken out of its positions, edges where effects have put them, and drives
+    that make of their commands what effects of the command path do.
 
-    moved: effects that move the joint's geometry, with their places and parameters. What a sensor adds is taken along
-    the readings at first, then along the motion that is left without it.
+    What a sensor adds is taken along the readings at first, then along the motion that is left without it.
     """
     raw, believed = recording.log, recording.believed
+    on_command = tuple(
+        {"name": effect.name, "acts_on": place, **values}
+        for effect, place, values in moved
+        if place.endswith("_command")
+    )
     there = recording
     for effect, place, values in moved:
-        if not place.endswith("_sensor") and believed.joint is not None:
+        if place == "contact_edge" and believed.joint is not None:
             known = quantities(recording, "end", place)
             out_m = {}
             for side in (-1.0, 1.0):
@@ -49,7 +54,7 @@ def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
             elif place == "end_sensor" and log.end_position_m is not None:
                 true_m = _true_m(there, log.end_position_m, effect, place, parameters, number == 0)
                 log = replace(log, end_position_m=true_m)
-        there = recording_of(log, believed)
+        there = recording_of(log, believed, on_command)
     return there
 
 

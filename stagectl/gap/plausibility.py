@@ -155,10 +155,14 @@ def _noise_m(position_m: np.ndarray) -> float:
     return float(np.sqrt(np.median(np.diff(position_m, 4) ** 2) / 0.455 / 70.0))
 
 
-def _in_band(recording: Recording, values: np.ndarray) -> np.ndarray:
-    h = recording.log.period_s
-    edge = round(_EDGE_S / h)
-    return np.asarray(sosfiltfilt(_band_pass(h), values))[edge:-edge]
+def in_band(values: np.ndarray, period_s: float) -> np.ndarray:
+    """Return values in the band that is compared, mirrored at either end, without both ends.
+
+    Turned round about their first value, as is usual, they would jump by twice the sensor's noise in it: 10 N of force
+    that rang for two seconds, and good recordings were refused as exchanged columns.
+    """
+    edge = round(_EDGE_S / period_s)
+    return np.asarray(sosfiltfilt(_band_pass(period_s), values, padtype="even"))[edge:-edge]
 
 
 @functools.cache
@@ -172,10 +176,10 @@ def _balance(recording: Recording, axis: str) -> _Balance:
     h, motion = recording.log.period_s, recording.motion(axis)
     raw_n = residual.missing_force_n(recording, axis, Forces())
     left_n = residual.missing_force_n(recording, axis, known_forces(recording))
-    inertia_n, force_n = _in_band(recording, raw_n), _in_band(recording, raw_n - left_n)
+    inertia_n, force_n = in_band(raw_n, h), in_band(raw_n - left_n, h)
     velocity = motion.velocity_m_per_s.mean(axis=1)
     others = [velocity, np.sign(velocity), motion.position_m.mean(axis=1)]
-    columns = np.column_stack([force_n, *(_in_band(recording, values) for values in others)])
+    columns = np.column_stack([force_n, *(in_band(values, h) for values in others)])
     scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-300
     normal = np.linalg.pinv((columns / scale).T @ (columns / scale), rcond=1e-10)
     solved = normal @ ((columns / scale).T @ inertia_n)

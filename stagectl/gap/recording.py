@@ -1,6 +1,7 @@
 """One log with all that does not depend on a hypothesis: motion, motor forces, where the joint touches. Pure."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,7 @@ class Recording:
     judged: dict[str, np.ndarray]
     known: dict[tuple[str, str], dict[str, np.ndarray]]  # quantities by axis and kind of place, once asked for
     reported_a: dict[str, np.ndarray]  # reported minus believed current at the samples, by axis, where it is known
+    on_command: tuple[dict[str, Any], ...] = ()  # effects of the command path that were found, as rows of a profile
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -80,7 +82,9 @@ class Recording:
         return delayed(command_n, self.belief(axis).latch_s / self.log.period_s)
 
 
-def put_together(log: Log, believed: Believed, macro: Motion, end: Motion | None) -> Recording:
+def put_together(
+    log: Log, believed: Believed, macro: Motion, end: Motion | None, on_command: tuple[dict[str, Any], ...] = ()
+) -> Recording:
     """Put together what is known along a motion; without one of the end, its own is made of the positions alone."""
     h = log.period_s
     macro_n, macro_at_n = driven(log.macro_command_n, believed.macro.latch_s, believed.macro.current_loop_s, h)
@@ -97,7 +101,9 @@ def put_together(log: Log, believed: Believed, macro: Motion, end: Motion | None
             side, depth, depth_rate = contact.side, contact.depth_m, contact.depth_rate_m_per_s
     else:
         end = None
-    recording = Recording(log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {})
+    recording = Recording(
+        log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {}, on_command
+    )
     for axis, reported_a in (("macro", log.macro_current_a), ("end", log.micro_current_a)):
         if axis in recording.axes and reported_a is not None and recording.belief(axis).current_noise_a is not None:
             believed_a = at_samples_n[axis] / recording.belief(axis).force_constant_n_per_a

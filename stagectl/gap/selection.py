@@ -11,8 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from stagectl.effects import CATALOGUE
-from stagectl.gap.normal_equations import Fold, Group, Sums, held_out_gain, solve, within_bounds
+from stagectl.effects import CATALOGUE, Trait
+from stagectl.gap.normal_equations import Fold, Group, Sums, covers, held_out_gain, solve, within_bounds
 
 NULL_QUANTILE = 0.99
 MATERIAL_RATIO = 0.005
@@ -37,7 +37,9 @@ RIVALS_COUNT = 6
 """Names whose shapes are searched in each round."""
 
 ALIAS_GAIN = 8.6
-"""Log-likelihood ratio (twice) below which two names can't be told apart: power 0.9 at 5 % false alarms."""
+"""Square of the distance between what two names say, in units of the noise, below which recordings can't tell them
+apart: power 0.9 at 5 % false alarms. Of the likelihoods as they came out (whose ratio scatters by twice the distance
+about it) half of all pairs at that distance would count as one."""
 
 ALIAS_SHARE = 0.002
 
@@ -123,6 +125,17 @@ class Judge:
         left = sum(s.gram[0, 0] - s.count for s in self.training) - gain[0]
         apart = sum(s.gram[0, 0] - s.count for s in held) - gain[1]
         return max(left, 0.0), max(apart, 0.0)
+
+    def reducible_before(self) -> tuple[float, float]:
+        """Return what the belief leaves, as it is or with its known parameters fitted, whichever is less.
+
+        Fitted beside an effect that nobody names yet, known parameters can make a recording worse that no fit saw.
+        """
+        fitted = self.reducible([])
+        found = []
+        for sums, left in zip((self.training, self.held or self.training), fitted, strict=True):
+            found.append(min(left, max(sum(s.gram[0, 0] - s.count for s in sums), 0.0)))
+        return found[0], found[1]
 
     def select(
         self, start: Sequence[Group] = (), most: int = 6, until: Callable[[Group], bool] = lambda group: False
@@ -263,18 +276,43 @@ class Judge:
         margins: dict[tuple[str, str], float] = {}
         taken = {other.key for other in chosen}
         for other in self.rivals(rest):
-            if other.key in taken or other.complexity > group.complexity or not self._allowed([*rest, other]):
+            if other.key in taken or _form(other) > _form(group) or not self._allowed([*rest, other]):
                 continue
             margin = with_it - self.gain([*rest, other])
-            if margin < ALIAS_GAIN + self._inexact_share(group, other) * gained:
+            too_near = self.distance([*rest, group], [*rest, other]) < ALIAS_GAIN
+            if too_near or margin < self._inexact_share(group, other) * gained:
                 margins[other.key] = margin
         return sorted(margins.items(), key=lambda row: row[1])
+
+    def distance(self, groups: Sequence[Group], others: Sequence[Group]) -> float:
+        """Return the square of the distance between what two models say of all recordings, in units of the noise."""
+        sums = self.source.sums
+        one, other = (solve([*self.base, *model], sums) for model in (groups, others))
+        total = 0.0
+        for s in sums:
+            apart = np.zeros(s.gram.shape[0])
+            for solution, sign in ((one, 1.0), (other, -1.0)):
+                for (column, scope), value in zip(solution.slots, solution.values, strict=True):
+                    if covers(scope, s):
+                        apart[column] += sign * value
+            total += float(apart @ s.gram @ apart)
+        return total
 
     def _inexact_share(self, group: Group, other: Group) -> float:
         """Return the share of a gain that two laws must differ by to be told apart."""
         if self.is_rough and _shows_at_low_speed(group) and _shows_at_low_speed(other):
             return LOW_SPEED_SHARE
         return ALIAS_SHARE
+
+
+def _form(group: Group) -> int:
+    """Return the numbers that a law is made of, without the place about which it acts.
+
+    A cable pulls towards its anchor wherever that is: with one near zero it is still a cable, and no wider a law than a
+    spring about zero. A Stribeck friction without a rise would be none.
+    """
+    known = CATALOGUE.get(group.key[0])
+    return group.complexity - (1 if known is not None and Trait.PLACED in known.traits else 0)
 
 
 def _shows_at_low_speed(group: Group) -> bool:

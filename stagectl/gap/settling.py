@@ -144,6 +144,16 @@ def moves_readings(search: Competition, group: Group) -> bool:
     return whole_of(term) and term.acts_on.endswith(("_sensor", "contact_edge"))
 
 
+def changes_commands(search: Competition, group: Group) -> bool:
+    """Tell whether an effect changes by more than a column says what a drive makes of its commands.
+
+    Taken for known, the drive's own delay and lag are uncertain where they then are: their columns and that of the
+    effect are one and the same there, and its interval is no narrower than what is stated of the drive.
+    """
+    term = search.term(group)
+    return whole_of(term) and term.acts_on.endswith("_command")
+
+
 def moved_by(search: Competition, chosen: list[Group], group: Group) -> Moved:
     """Return an effect at its fitted size, sessions pooled."""
     term = search.term(group)

@@ -99,7 +99,7 @@ def _found(
     say(f"{len(judge.library)} hypotheses of {len({g.key for g in judge.library})} names on {len(logs)} recordings")
     judge.calibrate()
     say("effects compete")
-    before = judge.reducible([])
+    before = judge.reducible_before()
     look = looked_closely(first, unsettled, noise, without, say, crew)
     solution = solve([*look.search.judge.base, *look.chosen], look.search.evidence.sums)
     named, widths = without_widths(look.named, look.search)

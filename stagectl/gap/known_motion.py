@@ -1,0 +1,57 @@
+"""Recordings under effects that are known: readings without their errors, the joint where they put it, the motion that
+then follows from the past. Pure.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from stagectl.gap import balance
+from stagectl.gap.competition import Competition
+from stagectl.gap.crew import Crew
+from stagectl.gap.effect_forces import known_forces
+from stagectl.gap.forces import sum_of_forces
+from stagectl.gap.hypotheses import Term
+from stagectl.gap.innovations import Noise
+from stagectl.gap.noise import Explained
+from stagectl.gap.normal_equations import Group
+from stagectl.gap.operating_point import Moved
+from stagectl.gap.recording import Recording
+from stagectl.gap.settling import changes_commands, moved_by, moves_readings, settled
+
+_FORETOLD_PASSES = 3  # a friction is known along a motion that knows of the friction
+
+
+class KnownMotion(NamedTuple):
+    """Recordings under known effects: those that move readings or edges, the others, and what these add."""
+
+    recordings: Sequence[Recording]
+    moved: tuple[Moved, ...]
+    kept: Sequence[Term]
+    explained: Explained
+
+
+def moved_under(
+    known: list[Group],
+    first: Competition,
+    unsettled: Sequence[Recording],
+    noise: dict[str, Noise],
+    crew: Crew,
+) -> KnownMotion:
+    """Return the recordings along the motion that `known` effects make, at the place where they put the joint.
+
+    unsettled: the recordings before the joint's edges were put where they are.
+    """
+    moving = [group for group in known if moves_readings(first, group) or changes_commands(first, group)]
+    still = [group for group in known if group not in moving]
+    explained = first.explained(still)
+    first.evidence.forget_trials()
+    there, moved, kept = settled(
+        unsettled,
+        noise,
+        tuple(moved_by(first, known, group) for group in moving),
+        tuple(first.term(group) for group in still),
+        crew,
+    )
+    for _ in range(_FORETOLD_PASSES if still else 1):
+        there = crew.here(lambda r: balance.foretold_under(r, sum_of_forces(known_forces(r), explained(r))), there)
+    return KnownMotion(there, moved, kept, explained)
