@@ -65,7 +65,7 @@ def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path, monkey
 
 
 def test_parts_are_named():
-    assert {"batch", "mutants"} <= set(service.PARTS)
+    assert set(service.PARTS) == {"batch", "processes", "losses", "pages", "soak", "mutants"}
     with pytest.raises(SystemExit, match="choose from batch, "):
         list(service.figures(full=False, say=lambda text: None, part="nothing"))
 
