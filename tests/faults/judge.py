@@ -10,10 +10,11 @@ never more than a plan may reach in it. A macro without power has the way to its
 
 Rest is |v| < 1 mm/s, also for an axis that loses its power: one that is let go of faster has not come to rest, and
 its way goes on counting. From rest on a drive holds on its encoder. Its loop needs 0.2 s until it stands; that way is
-part of the travel, so no instant is judged by neither bar. An obstacle pushes the macro back, against a drive that
-holds; when it is gone the drive comes back to where its ramp ended, and a fifth of that way beyond, which is the
-overshoot of a position loop with an integral. That is a spring, no command: only forward travel is judged until the
-obstacle is gone and the loop stands, by the same bound; from there on the macro must stand as after any fault.
+part of the travel, and no more than 0.2 mm, so no instant is judged by neither bar. An obstacle pushes the macro
+back, against a drive that holds; when it is gone the drive comes back to where its ramp ended, and a fifth of that
+way beyond, which is the overshoot of a position loop with an integral. That is a spring, no command: only forward
+travel is judged until the obstacle is gone and the loop stands, by the same bound; from there on the macro must stand
+as after any fault.
 """
 
 import contextlib
@@ -34,6 +35,7 @@ REST_M_PER_S = 1e-3
 STANDSTILL_M = 20e-6  # a drive that holds on its encoder gives way so far when a force changes
 REST_SAMPLES = 20
 SETTLED_SAMPLES = 200  # what a drive's position loop needs until it stands; part of the travel
+SETTLING_M = 200e-6  # and how far it may go in it
 RELEASED_SAMPLES = 500  # the same, where an obstacle had pushed it millimetres away: six times the integral's 80 ms
 OVERSHOOT = 0.2  # of the way back
 SLOPE_SAMPLES = 10  # over which an acceleration is taken
@@ -153,6 +155,10 @@ def judge(drawn: Drawn, facts: Facts, record: Record) -> Verdict:
             found.append((STANDSTILL, "it never stood still"))
         found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
         held_m, drift_m = _moved_after(seen, stands, end)
+        if rest is not None and not drawn.pushed:
+            settled_m = float(np.abs(position[rest:stands] - position[rest]).max(initial=0.0))
+            if settled_m > SETTLING_M:
+                found.append((STANDSTILL, f"macro moved {settled_m * 1e6:.0f} um while it settled"))
         if held_m > STANDSTILL_M:
             found.append((STANDSTILL, f"macro moved {held_m * 1e6:.0f} um after standstill, with power"))
         if noticed is not None and not dark:

@@ -1,6 +1,7 @@
 """`python -m bench service`: what it makes of its runs, its journal, and its mutants."""
 
 import ast
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from bench import service, service_batch
 from bench.journal import Journal
-from bench.mutation import mutants, uncompiled
+from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
 from tests.faults.judge import BACK, LOST, TRAVEL
 
@@ -103,6 +104,25 @@ def test_uncompiled_code_sees_fields_of_a_row():
     rows["cycle"] = 7
     assert step(rows[0], 2.5) == 7
     assert rows["force_n"][0] == 2.5
+
+
+def test_a_mutant_is_alive_where_no_test_notices_it():
+    """Three that the tests of the lease must see, and one that changes nothing."""
+    name, tests = "stagectl.service.lease", ["tests/service/test_lease_edges.py"]
+    made = {one.key: one for one in mutants((ROOT / "stagectl/service/lease.py").read_text())}
+    seen = [
+        made["Lease.left_s: max(self.until_s - now_s, 0.0) -> min(self.until_s - now_s, 0.0)"],
+        made["module: in GRACE_S = 1.0: 1.0 -> 2.0"],
+        made["take: now_s + duration_s -> now_s - duration_s"],
+    ]
+    nothing = replace(seen[0], replacement=seen[0].kept)
+    said = []
+    found = trial(name, [*seen, nothing], tests, 30.0, said.append)
+    assert found.alive == (3,)
+    assert found.tests_count > 20
+    assert len(said) == 1
+    with pytest.raises(RuntimeError, match="no test could be collected"):
+        trial(name, [nothing], ["tests/service/there_is_none.py"], 30.0, said.append)
 
 
 @pytest.mark.parametrize("module", MODULES)
