@@ -27,6 +27,7 @@ from tests.faults.real import House
 from tests.service.daemon import servo_pid
 
 _DISK_BYTES = 192 << 20
+_PATIENCE_S = 30.0
 _SHARED_MEMORY = Path("/dev/shm")
 _EXT4_IOC_SHUTDOWN, _NO_FLUSH = 0x8004_587D, 2  # linux/ext4.h
 
@@ -86,7 +87,8 @@ def after_kill(folder: Path, which: str) -> Loss:
             house.daemon.process.kill()
             house.daemon.process.wait()
             state = house.state()
-            while Path(f"/proc/{servo}").exists():  # it stops the stage, then saves the rows
+            give_up_s = time.monotonic() + _PATIENCE_S
+            while _works(servo) and time.monotonic() < give_up_s:  # it stops the stage, then saves the rows
                 with contextlib.suppress(StagectlError):
                     state = house.state()
                 time.sleep(0.02)
@@ -95,8 +97,16 @@ def after_kill(folder: Path, which: str) -> Loss:
         house.close()
 
 
+def _works(pid: int) -> bool:
+    """Tell whether a process is there and no zombie that nobody has looked after."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def _until_closed(runs: Path) -> None:
-    give_up_s = time.monotonic() + 30.0
+    give_up_s = time.monotonic() + _PATIENCE_S
     while time.monotonic() < give_up_s:
         if all('"state": "recording"' not in path.read_text() for path in runs.glob("*/manifest.json")):
             return
