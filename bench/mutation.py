@@ -337,7 +337,7 @@ def put(module: types.ModuleType, tree: ast.Module, function: str) -> None:
     made: dict[str, Any] = dict(module.__dict__)
     if function == "module":
         before = dict(made)
-        constants = [
+        constants: list[ast.stmt] = [
             node for node in tree.body if isinstance(node, ast.Assign) and not isinstance(node.value, ast.Call)
         ]
         exec(compile(ast.Module(constants, []), str(module.__file__), "exec"), made)
