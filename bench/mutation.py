@@ -41,6 +41,7 @@ _COMPUTED: dict[type[ast.operator], type[ast.operator]] = {
     ast.LShift: ast.RShift,
 }
 _CALLED = {"min": "max", "max": "min"}
+_NOT_TRIED = 3  # an exit code that pytest's results don't use here
 _DELETED = (ast.Assign, ast.AugAssign, ast.Raise, ast.Return)
 
 
@@ -239,7 +240,7 @@ def trial(module: str, changed: list[Mutant], tests: list[str], timeout_s: float
             elif word == "tests":
                 count = int(value)
             elif word == "wrong":
-                raise RuntimeError(f"{module} does not pass its tests uncompiled: {value}; mend that first")
+                raise RuntimeError(f"{module}, uncompiled, does not pass {value}; mend that first")
     os.waitpid(pid, 0)
     if not count:
         raise RuntimeError(f"{module}: no test could be collected from {tests}; run them by themselves")
@@ -264,7 +265,8 @@ def _collect(name: str, changed: list[Mutant], tests: list[str], timeout_s: floa
         sys.modules.pop(path.removesuffix(".py").replace("/", "."), None)
     known = "ignore::pytest.PytestAssertRewriteWarning"  # libraries that the first process has imported
     plugin = _Session(module, changed, timeout_s, out)
-    pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-W", known, *tests], plugins=[plugin])
+    quick = ("-x", "-q", "-p", "no:cacheprovider", "--tb=no", "--assert=plain")  # nobody reads why a mutant died
+    pytest.main([*quick, "-W", known, *tests], plugins=[plugin])
 
 
 class _Session:
@@ -317,16 +319,19 @@ class _Session:
         if pid == 0:
             signal.signal(signal.SIGALRM, signal.SIG_DFL)  # a mutant that never ends is killed by the clock
             signal.setitimer(signal.ITIMER_REAL, self.timeout_s)
-            code = 1
+            code = _NOT_TRIED
             try:
                 put(self.module, mutant.apply(), mutant.function)
+                code = 1
                 killer = self._run(items)
                 place[:4] = (killer or 0).to_bytes(4, "little")
                 code = 0 if killer is None else 1
             finally:
                 os._exit(code)
-        survived = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
-        return None if survived else int.from_bytes(place[:4], "little")
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        if code == _NOT_TRIED:
+            self._say("wrong", f"the mutant {mutant.key} can't be put in its place")
+        return None if code == 0 else int.from_bytes(place[:4], "little")
 
 
 def put(module: types.ModuleType, tree: ast.Module, function: str) -> None:

@@ -127,10 +127,10 @@ def judge(drawn: Drawn, facts: Facts, record: Record) -> Verdict:
         found.append((COURSE, f"stopped by {facts.fault_kind}"))
     travel_m = bound_m = begun = drift_m = 0.0
     end = rests = int(np.searchsorted(t_ns, facts.judged_until_t_ns))
-    if not facts.fault_kind:
+    if not facts.fault_kind and facts.phase == "stopping":  # a homing takes power away and gives it again
         at = int(np.searchsorted(t_ns, facts.fault_t_ns))
         found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
-    else:
+    if facts.fault_kind:
         counts_from, detection_s = facts.fault_t_ns, drawn.detection_s
         if not np.isfinite(detection_s):
             counts_from, detection_s = noticed or facts.fault_t_ns, CYCLE_S

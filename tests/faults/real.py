@@ -38,6 +38,7 @@ _JOG_M_PER_S, _REACH_M = 0.12, 0.12
 _LOOK_S = 0.02
 _REST_S = 0.5
 _PATIENCE_S = 60.0
+_TRIES = 3
 _CASES_COUNT = 3  # of every operation of the API, with data that fit and with data that don't
 _NO_LEASE = ("/v1/record", "/v1/record/trigger")
 
@@ -410,9 +411,13 @@ def _play(house: House, kind: Kind, seed: int) -> tuple[list[tuple[str, str]], f
     daemon = house.daemon
     daemon.state_is("idle")
     house.find_rig()
-    trouble = house.ready()
-    if trouble or not house.set_off():
-        return [(BACK, f"the scene could not be set: {trouble or 'it does not move'}")], 0.0, 0.0, ""
+    for _ in range(_TRIES):  # a hiccup of the host may trip it before anything was done to it
+        trouble = house.ready() or ("" if house.set_off() else "it does not move")
+        if not trouble:
+            break
+        house.let_go()
+    else:
+        return [(BACK, f"the scene could not be set: {trouble}")], 0.0, 0.0, ""
     time.sleep(float(rng.uniform(0.0, 0.3)))
     before = house.state()
     kind.strike(house)
@@ -426,6 +431,9 @@ def _play(house: House, kind: Kind, seed: int) -> tuple[list[tuple[str, str]], f
         daemon.start()
         daemon.client.lease_token = ""
         daemon.state_is("idle", "fault")
+    elif kind.must_stop:  # the stop's end is told when the drives are seen to stand, or are not for seconds
+        with contextlib.suppress(AssertionError):
+            daemon.state_is("fault")
     status = daemon.client.status()
     fault_kind = status.fault.kind if status.fault is not None else ""
     stopped = bool(fault_kind) or gone
