@@ -206,6 +206,10 @@ class House:
 
 
 def killed_child(house: House) -> None:
+    """Kill the servo; the supervisor, with whom the rig would go, looks away until the drives have stopped it."""
+    supervisor = house.daemon.process.pid
+    os.kill(supervisor, signal.SIGSTOP)
+    _later(1.0, lambda: _go_on(supervisor))
     os.kill(servo_pid(house.daemon), signal.SIGKILL)
 
 
@@ -468,7 +472,12 @@ def _watch(house: House, kind: Kind, before: dict) -> tuple[list[tuple[str, str]
     at_m = before["plant"]["macro_position_m"]
     travel_m, state = 0.0, before
     while True:
-        state = house.state()
+        try:
+            state = house.state()
+        except LinkError:  # the service let go of a world that it lost its servo in, and its rig went with it
+            if abs(state["plant"]["macro_velocity_m_per_s"]) < REST_M_PER_S:
+                return [], travel_m, state
+            return [(STANDSTILL, "the rig was gone before the macro stood")], travel_m, state
         now_s = time.monotonic()
         travel_m = max(travel_m, abs(state["plant"]["macro_position_m"] - at_m))
         slow = abs(state["plant"]["macro_velocity_m_per_s"]) < REST_M_PER_S

@@ -11,7 +11,7 @@ from tests.faults.kinds import KINDS, SILENCE_S, Drawn
 from tests.faults.scene import Facts
 from tests.faults.witness import ENABLED
 
-SEEDS = (0, 8, 12)
+SEEDS = (8, 12, 46)  # 46: a macro position that stands still while the macro moves
 _STOPPED = 5  # QUICK_STOP_ACTIVE
 
 
