@@ -23,7 +23,7 @@ import pyarrow as pa
 from stagectl.errors import StagectlError
 from stagectl.record import read_run
 from stagectl.ring import RingReader
-from tests.faults.real import House
+from tests.faults.house import House
 from tests.service.daemon import servo_pid
 
 _DISK_BYTES = 192 << 20

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stagectl.errors import StagectlError
-from tests.faults.real import House
+from tests.faults.house import House
 from tests.service.daemon import servo_pid
 
 PAGE_BYTES = 4096

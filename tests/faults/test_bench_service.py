@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import service, service_batch
+from bench import service, service_batch, service_processes
 from bench.journal import Journal
 from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
+from tests.faults import real
 from tests.faults.judge import BACK, LOST, TRAVEL
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -63,6 +64,21 @@ def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path, monkey
     Journal("test").keep(6, {"line": "six"})
     assert Journal("test").entries == {4: {"line": "four"}, 6: {"line": "six"}}
     assert Journal(None).entries == {}
+
+
+def test_the_bound_of_a_run_with_real_processes():
+    """t = 0.1 + 0.001 + 0.01 s, a = 2.25 m/s^2 by the plan, ramp 5 m/s^2: 13.32 + 13.86 + 13.67 mm."""
+    moving = {"macro_velocity_m_per_s": -0.12, "macro_position_m": 0.05}
+    assert real._bound_m(real.KINDS["servo killed"], moving, 0.01) == pytest.approx(40.85e-3, abs=0.02e-3)
+    coasts = real._bound_m(real.KINDS["drive reboot"], moving, 0.01)
+    assert coasts == pytest.approx(0.05 + 0.17 + 0.008)
+
+
+def test_the_seeded_part_has_every_process_killed_and_stopped():
+    kinds = {list(real.KINDS)[seed % len(real.KINDS)] for seed in service_processes.SEEDS}
+    assert len(kinds) == len(service_processes.SEEDS) >= 10
+    struck = {f"{name} {how}" for name in ("servo", "supervisor") for how in ("killed", "stopped")}
+    assert struck | {"disk full", "two operators", "hostile API (schemathesis)", "client vanishes in mid jog"} <= kinds
 
 
 def test_parts_are_named():
