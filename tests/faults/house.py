@@ -121,7 +121,7 @@ class House:
         self._jogging.set()
         give_up_s = time.monotonic() + 10.0
         while time.monotonic() < give_up_s:
-            if abs(self.state()["plant"]["macro_velocity_m_per_s"]) > 0.9 * JOG_M_PER_S:
+            if abs(self.state()["plant"]["macro_velocity_m_per_s"]) > 0.95 * JOG_M_PER_S:
                 return True
             time.sleep(LOOK_S)
         return False
