@@ -1,4 +1,4 @@
-"""Mutants of one module: every small change of its code that a test should notice, each run in a process of its own.
+"""Mutants of one module: every small change of its code that a test should notice, each tried in a process of its own.
 
 Code runs uncompiled: `stagectl.compiled` is replaced, so that a mutant costs no compiler. A mutant is killed when a
 test fails, or takes longer than it may.
@@ -6,6 +6,10 @@ test fails, or takes longer than it may.
 
 import ast
 import copy
+import functools
+import importlib
+import inspect
+import mmap
 import os
 import signal
 import sys
@@ -13,12 +17,10 @@ import time
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
-_ROOT = Path(__file__).resolve().parent.parent
 _COMPARED: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.LtE, ast.Gt),
     ast.LtE: (ast.Lt, ast.Gt),
@@ -39,6 +41,7 @@ _COMPUTED: dict[type[ast.operator], type[ast.operator]] = {
     ast.LShift: ast.RShift,
 }
 _CALLED = {"min": "max", "max": "min"}
+_NOT_TRIED = 3  # an exit code that pytest's results don't use here
 _DELETED = (ast.Assign, ast.AugAssign, ast.Raise, ast.Return)
 
 
@@ -196,50 +199,159 @@ class _Fields:
 def uncompiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Run as Python what is written to be compiled."""
 
+    @functools.wraps(function)
     def call(*arguments: Any) -> Any:
         return function(*(_Fields(one) if isinstance(one, np.void) else one for one in arguments))
 
     return call
 
 
-def survives(module: str, make: Callable[[], ast.Module], tests: list[str], timeout_s: float) -> bool:
-    """Run the tests against what `make` returns, in a forked process; tell whether all of them pass."""
+@dataclass(frozen=True)
+class Trial:
+    """Which of the mutants handed in the tests did not notice."""
+
+    alive: tuple[int, ...]
+    tests_count: int
+
+
+def trial(module: str, changed: list[Mutant], tests: list[str], timeout_s: float, say: Callable[[str], None]) -> Trial:
+    """Run the tests of a module against each mutant; RuntimeError where they don't pass without any.
+
+    All happens in one forked process that collects the tests once, uncompiled; each mutant is a fork of that, tries the
+    quickest tests first, and ends at the first that fails.
+    """
+    reader, writer = os.pipe()
     pid = os.fork()
     if pid == 0:
-        code = 1
+        os.close(reader)
         try:
-            code = _run(module, make(), tests)
+            with os.fdopen(writer, "w") as out:
+                _collect(module, changed, tests, timeout_s, out)
         finally:
-            os._exit(code)
-    until_s = time.monotonic() + timeout_s
-    while True:
-        ended, status = os.waitpid(pid, os.WNOHANG)
-        if ended:
-            return os.waitstatus_to_exitcode(status) == 0
-        if time.monotonic() > until_s:
-            os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
-            return False
-        time.sleep(0.01)
+            os._exit(0)
+    os.close(writer)
+    alive, count = [], 0
+    with os.fdopen(reader) as found:
+        for line in found:
+            word, _, value = line.strip().partition(" ")
+            if word == "alive":
+                alive.append(int(value))
+                say(f"survived: {module}:{changed[alive[-1]].line} {changed[alive[-1]].key}")
+            elif word == "tests":
+                count = int(value)
+            elif word == "wrong":
+                raise RuntimeError(f"{module}, uncompiled, does not pass {value}; mend that first")
+    os.waitpid(pid, 0)
+    if not count:
+        raise RuntimeError(f"{module}: no test could be collected from {tests}; run them by themselves")
+    return Trial(tuple(alive), count)
 
 
-def _run(name: str, tree: ast.Module, tests: list[str]) -> int:
-    """Put the mutant where the module was, and run the tests, which import it anew."""
+def _collect(name: str, changed: list[Mutant], tests: list[str], timeout_s: float, out: TextIO) -> None:
+    """Import the module uncompiled and collect its tests; `_Session` does the rest."""
     import pytest
 
     from stagectl import compiled as compiler
 
-    out = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(out, 1)
-    os.dup2(out, 2)
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
     compiler.compiled = uncompiled  # type: ignore[assignment]
-    module = types.ModuleType(name)
-    module.__file__ = str(_ROOT / (name.replace(".", "/") + ".py"))
-    sys.modules[name] = module
-    exec(compile(ast.fix_missing_locations(tree), module.__file__, "exec"), module.__dict__)
+    sys.modules.pop(name, None)
+    module = importlib.import_module(name)
     package, _, last = name.rpartition(".")
     setattr(sys.modules[package], last, module)
     for path in tests:
         sys.modules.pop(path.removesuffix(".py").replace("/", "."), None)
     known = "ignore::pytest.PytestAssertRewriteWarning"  # libraries that the first process has imported
-    return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-W", known, *tests]))
+    plugin = _Session(module, changed, timeout_s, out)
+    quick = ("-x", "-q", "-p", "no:cacheprovider", "--tb=no", "--assert=plain")  # nobody reads why a mutant died
+    pytest.main([*quick, "-W", known, *tests], plugins=[plugin])
+
+
+class _Session:
+    """A plugin that runs what was collected once as it is, and once for each mutant."""
+
+    def __init__(self, module: types.ModuleType, changed: list[Mutant], timeout_s: float, out: TextIO) -> None:
+        self.module, self.changed, self.timeout_s, self.out = module, changed, timeout_s, out
+        self.failed = ""
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        if report.failed:
+            self.failed = report.nodeid
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        took_s = {}
+        for item in session.items:
+            began_s = time.monotonic()
+            self._run([item])
+            took_s[item] = time.monotonic() - began_s
+            if self.failed:
+                self._say("wrong", self.failed)
+                return True
+        items = sorted(session.items, key=lambda item: took_s[item])
+        for number, mutant in enumerate(self.changed):
+            killer = self._killer(mutant, items)
+            if killer is None:
+                self._say("alive", number)
+            elif killer:
+                items.insert(0, items.pop(killer))  # what noticed one change of a line often notices the next
+        self._say("tests", len(items))
+        return True
+
+    def _say(self, word: str, value: Any) -> None:
+        self.out.write(f"{word} {value}\n")
+        self.out.flush()
+
+    def _run(self, items: list[Any]) -> int | None:
+        """Run tests up to the first that fails; return its place, None where all pass."""
+        for k, item in enumerate(items):
+            following = items[k + 1] if k + 1 < len(items) else None
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+            if self.failed:
+                return k
+        return None
+
+    def _killer(self, mutant: Mutant, items: list[Any]) -> int | None:
+        """Try a mutant in a fork; return the place of the test that noticed it, 0 too where it never ended."""
+        place = mmap.mmap(-1, mmap.PAGESIZE)
+        pid = os.fork()
+        if pid == 0:
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)  # a mutant that never ends is killed by the clock
+            signal.setitimer(signal.ITIMER_REAL, self.timeout_s)
+            code = _NOT_TRIED
+            try:
+                put(self.module, mutant.apply(), mutant.function)
+                code = 1
+                killer = self._run(items)
+                place[:4] = (killer or 0).to_bytes(4, "little")
+                code = 0 if killer is None else 1
+            finally:
+                os._exit(code)
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        if code == _NOT_TRIED:
+            self._say("wrong", f"the mutant {mutant.key} can't be put in its place")
+        return None if code == 0 else int.from_bytes(place[:4], "little")
+
+
+def put(module: types.ModuleType, tree: ast.Module, function: str) -> None:
+    """Give a module's function the code that a tree has for it, or its constants their values, in place.
+
+    In place, because tests hold functions and classes that they imported.
+    """
+    made: dict[str, Any] = dict(module.__dict__)
+    if function == "module":
+        before = dict(made)
+        constants: list[ast.stmt] = [
+            node for node in tree.body if isinstance(node, ast.Assign) and not isinstance(node.value, ast.Call)
+        ]
+        exec(compile(ast.Module(constants, []), str(module.__file__), "exec"), made)
+        module.__dict__.update({name: value for name, value in made.items() if before.get(name) is not value})
+        return
+    exec(compile(tree, str(module.__file__), "exec"), made)
+    old: Any = module
+    new: Any = types.SimpleNamespace(**{name: made[name] for name in made if name.isidentifier()})
+    for name in function.split("."):
+        old, new = getattr(old, name), getattr(new, name)
+    old, new = inspect.unwrap(old), inspect.unwrap(new)
+    old.__code__, old.__defaults__, old.__kwdefaults__ = new.__code__, new.__defaults__, new.__kwdefaults__

@@ -1,4 +1,4 @@
-"""The service under faults: seeded runs on the rig in virtual time, and mutation tests of guard and lease.
+"""The service under faults: seeded runs in virtual time and with real processes, losses, pages, soak, mutants.
 
 `--seed N` plays one run of the batch campaign and says what was seen; `--part NAME` does one part. Without `--full`
 the parts take 15 minutes together; with it, an interrupted campaign goes on where its journal ends.
@@ -6,7 +6,7 @@ the parts take 15 minutes together; with it, an interrupted campaign goes on whe
 
 from collections.abc import Callable, Iterator
 
-from bench import service_batch, service_mutants
+from bench import service_batch, service_mutants, service_processes, ten_pages
 from bench.figure import Figure
 
 ABOUT = (
@@ -18,6 +18,10 @@ Say = Callable[[str], None]
 
 PARTS: dict[str, Callable[..., Iterator[Figure]]] = {
     "batch": service_batch.figures,
+    "processes": service_processes.figures,
+    "losses": service_processes.loss_figures,
+    "pages": ten_pages.figures,
+    "soak": service_processes.soak_figures,
     "mutants": service_mutants.figures,
 }
 """By the name that `--part` takes."""
@@ -26,7 +30,8 @@ PARTS: dict[str, Callable[..., Iterator[Figure]]] = {
 def figures(*, full: bool, say: Say, seed: int | None = None, part: str | None = None) -> Iterator[Figure]:
     """Measure every row, or those of one part; with `seed`, of one run in batch."""
     if seed is not None:
-        yield from service_batch.figures(full=False, say=say, seeds=[seed])
+        runs = service_processes.figures if part == "processes" else service_batch.figures
+        yield from runs(full=False, say=say, seeds=[seed])
         return
     if part is not None and part not in PARTS:
         raise SystemExit(f"bench service --part {part}: choose from {', '.join(PARTS)}")

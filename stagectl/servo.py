@@ -170,6 +170,7 @@ class Servo:
         self._deadline_t_ns = 0
         self._rest_mark_t_ns = 0
         self._rest_mark_m = 0.0
+        self._rests_from_t_ns = 0  # before that no ramp can have brought it to rest
 
     @property
     def mode(self) -> Mode:
@@ -356,6 +357,11 @@ class Servo:
         elif phase is Phase.QUICK_STOP and text and text not in self.text:
             self.text = f"{self.text}; then {text}"
         self._rest_mark_t_ns, self._rest_mark_m = t_ns, float("nan")
+        if self.phase in (Phase.TRACKING, Phase.STOPPING):
+            guard = self.tracker.active.guard
+            speed, limit = abs(float(guard["macro_velocity_m_per_s"][0])), float(guard["velocity_limit_m_per_s"][0])
+            ramp_s = (speed if speed <= limit else limit) / float(guard["stop_deceleration_m_per_s2"][0])
+            self._rests_from_t_ns = t_ns + round(1e9 * ramp_s)
         self._enter(phase, t_ns)
 
     def _refusal(self, mode: Mode) -> tuple[Stop, str]:
@@ -480,8 +486,13 @@ class Servo:
         return Stop.DRIVE_FAULT, self._detail(Stop.DRIVE_FAULT)
 
     def _stands(self, t_ns: int) -> bool:
-        """Tell whether the macro's own encoder has been still for a while."""
+        """Tell whether the macro's own encoder has been still for a while, no sooner than its ramp can end.
+
+        A position that is stuck, or no position at all in a mapping that another master changed, is still too.
+        """
         seen = self._seen
+        if t_ns < self._rests_from_t_ns:
+            return False
         if not seen.tpdos_new & 1 or t_ns - self._rest_mark_t_ns < _REST_WINDOW_NS:
             return False
         encoder_m, since_s = seen.macro_encoder_m, (t_ns - self._rest_mark_t_ns) * 1e-9

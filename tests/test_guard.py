@@ -191,6 +191,14 @@ def test_silence_is_counted_in_three_cycles_at_least(oled_profile):
     ]
 
 
+def test_lost_commands_are_counted_in_three_cycles_at_least(oled_profile):
+    one = Cycle(with_values(oled_profile, trip__sensor_age_s=0.5e-3))
+    assert [one.next(command_lost=1, sample_t_ns=one.measurement["t_ns"] + MS) for _ in range(4)] == [
+        *[Stop.NONE] * 3,
+        Stop.COMMAND_LOST,
+    ]
+
+
 def moving(profile, speed_m_per_s: float, start_m: float, cycles: int = 400) -> tuple[Stop, float]:
     """Move everything at one speed until the guard stops it; return its code and where that was."""
     one = Cycle(profile)
@@ -269,12 +277,35 @@ def test_a_late_line_makes_its_own_speed(cycle):
     assert cycle.guard["macro_velocity_m_per_s"][0] == pytest.approx(0.04 + 0.2 * (0.1 - 0.04), rel=1e-9)
 
 
+def test_a_number_without_a_sample_is_no_speed(cycle):
+    """A counter that goes on while no line came says nothing of where the macro is."""
+    cycle.stop()
+    cycle.next(samples_new=0, macro_position_m=5e-4)
+    assert cycle.guard["macro_velocity_m_per_s"][0] == 0.0
+    assert cycle.guard["macro_position_m"][0] == 0.0
+
+
+def test_a_reference_that_is_nan_stops_without_a_new_sample_too(cycle):
+    cycle.stop()
+    assert cycle.next(samples_new=0, setpoint_position_m=math.nan) is Stop.FOLLOWING_ERROR
+
+
+def test_while_the_drive_brakes_what_the_law_asks_for_heats_nothing(oled_profile):
+    """Its force does not go out; a stop of its own would say why wrongly."""
+    one = Cycle(with_values(oled_profile, macro__thermal_time_constant_s=0.01, micro__thermal_time_constant_s=0.01))
+    one.guard["braking"] = 1.0
+    one.set(macro_n=2500.0, micro_n=179.0)
+    assert [one.next() for _ in range(50)] == [Stop.NONE] * 50
+    assert one.guard["macro_heat_n2"][0] == one.guard["micro_heat_n2"][0] == 0.0
+
+
 @pytest.mark.parametrize(
-    ("axis", "force_n", "limit_n", "tau_s"), [("macro", 1400.0, 700.0, 60.0), ("micro", -90.0, 60.0, 20.0)]
+    ("axis", "force_n", "limit_n", "tau_s"), [("macro", 1400.0, 700.0, 6.0), ("micro", -90.0, 60.0, 2.0)]
 )
-def test_thermal_limit(cycle, axis, force_n, limit_n, tau_s):
+def test_thermal_limit(oled_profile, axis, force_n, limit_n, tau_s):
     """The square of the force heats with one time constant: t = -tau ln(1 - (limit / force)^2)."""
     expected_s = -tau_s * math.log(1.0 - (limit_n / force_n) ** 2)
+    cycle = Cycle(with_values(oled_profile, **{f"{axis}__thermal_time_constant_s": tau_s}))
     cycle.set(**{f"{axis}_n": force_n})
     cycles = 0
     while (stop := cycle.next()) is Stop.NONE:
@@ -284,9 +315,18 @@ def test_thermal_limit(cycle, axis, force_n, limit_n, tau_s):
     assert cycles * 1e-3 == pytest.approx(expected_s, rel=1e-3)
 
 
-def test_the_continuous_force_may_stay(cycle):
-    cycle.set(macro_n=699.9, micro_n=-59.9)
-    assert all(cycle.next() is Stop.NONE for _ in range(60_000))
+@pytest.mark.parametrize(("axis", "limit_n"), [("macro", 700.0), ("micro", 60.0)])
+def test_heat_at_its_very_limit_may_stay(cycle, axis, limit_n):
+    cycle.guard[f"{axis}_heat_n2"] = limit_n * limit_n
+    assert cycle.set(**{f"{axis}_n": limit_n}).stop() is Stop.NONE
+    assert cycle.next(**{f"{axis}_n": 1.01 * limit_n}) is Stop.THERMAL
+
+
+def test_the_continuous_force_may_stay(oled_profile):
+    """For ten time constants, of which there is nothing left to come."""
+    quick = with_values(oled_profile, macro__thermal_time_constant_s=0.2, micro__thermal_time_constant_s=0.2)
+    cycle = Cycle(quick).set(macro_n=699.9, micro_n=-59.9)
+    assert all(cycle.next() is Stop.NONE for _ in range(2000))
 
 
 def test_finiteness_comes_first(cycle):

@@ -4,8 +4,17 @@ The macro may go, from the fault on,
 
     v t + a t^2 / 2 + (v + a t)^2 / (2 ramp)
 
-with v and a true at that instant, t the detection time and one cycle, and a no more than what a planned motion may
-reach within t. A macro without power has the way to its end stops instead.
+with v and a true at that instant and t the detection time and one cycle. Where commands still arrive while the fault
+is not yet noticed, the planned motion goes on: a is the greatest gain of speed that was truly seen within t, and
+never more than a plan may reach in it. A macro without power has the way to its end stops instead.
+
+Rest is |v| < 1 mm/s, also for an axis that loses its power: one that is let go of faster has not come to rest, and
+its way goes on counting. From rest on a drive holds on its encoder. Its loop needs 0.2 s until it stands; that way is
+part of the travel, and no more than 0.2 mm, so no instant is judged by neither bar. An obstacle pushes the macro
+back, against a drive that holds; when it is gone the drive comes back to where its ramp ended, and a fifth of that
+way beyond, which is the overshoot of a position loop with an integral. That is a spring, no command: only forward
+travel is judged until the obstacle is gone and the loop stands, by the same bound; from there on the macro must stand
+as after any fault.
 """
 
 import contextlib
@@ -25,10 +34,11 @@ PLAN_M_PER_S2, PLAN_M_PER_S3 = 0.9, 9.0  # what moves of this profile are planne
 REST_M_PER_S = 1e-3
 STANDSTILL_M = 20e-6  # a drive that holds on its encoder gives way so far when a force changes
 REST_SAMPLES = 20
-LET_GO_M_PER_S = (
-    5e-3  # an axis that loses its power at rest begins to drift; faster than this it was let go of at speed
-)
-SETTLED_SAMPLES = 200  # a ramp's last micrometres are part of the stop
+SETTLED_SAMPLES = 200  # what a drive's position loop needs until it stands; part of the travel
+SETTLING_M = 200e-6  # and how far it may go in it
+RELEASED_SAMPLES = 500  # the same, where an obstacle had pushed it millimetres away: six times the integral's 80 ms
+OVERSHOOT = 0.2  # of the way back
+SLOPE_SAMPLES = 10  # over which an acceleration is taken
 BEGUN_CYCLES = 2
 STOPS_M = (-0.50, 0.50)  # the machine's
 STOPS_GIVE_M = 8e-3
@@ -116,29 +126,46 @@ def judge(drawn: Drawn, facts: Facts, record: Record) -> Verdict:
     if not drawn.may_stop and facts.fault_kind:
         found.append((COURSE, f"stopped by {facts.fault_kind}"))
     travel_m = bound_m = begun = drift_m = 0.0
+    end = rests = int(np.searchsorted(t_ns, facts.judged_until_t_ns))
+    if not facts.fault_kind and facts.phase == "stopping":  # a homing takes power away and gives it again
+        at = int(np.searchsorted(t_ns, facts.fault_t_ns))
+        found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
     if facts.fault_kind:
         counts_from, detection_s = facts.fault_t_ns, drawn.detection_s
         if not np.isfinite(detection_s):
             counts_from, detection_s = noticed or facts.fault_t_ns, CYCLE_S
         at = int(np.searchsorted(t_ns, counts_from))
-        end = int(np.searchsorted(t_ns, facts.judged_until_t_ns))
         dark = MACRO in drawn.without_power
         rest = _rest(seen, at, end, noticed)
-        travel_m = float(np.abs(position[at : rest or end] - position[at]).max(initial=0.0))
+        stands, rests = _stands(seen, rest, end), end if rest is None else rest
+        back_m = 0.0
+        if drawn.pushed:
+            free = min(int(np.searchsorted(t_ns, facts.fault_t_ns + round(1e9 * drawn.lasts_s))), end)
+            stands = min(max(stands, free + RELEASED_SAMPLES), end)
+            away_m = (position[at:stands] - position[at]) * np.sign(velocity[at])
+            back_m = OVERSHOOT * abs(float(position[stands - 1] - position[free]))
+        else:
+            away_m = np.abs(position[at:stands] - position[at])
+        travel_m = float(away_m.max(initial=0.0))
         bound_m = _way_to_stops_m(velocity, position, at) if dark else _bound_m(t_ns, velocity, at, detection_s)
-        if not travel_m <= bound_m + STANDSTILL_M and not drawn.pushed:
+        bound_m += back_m
+        if not travel_m <= bound_m + STANDSTILL_M:
             found.append((TRAVEL, f"macro went {travel_m * 1e3:.3f} mm, bound {bound_m * 1e3:.3f} mm"))
         if rest is None and not dark:
             found.append((STANDSTILL, "it never stood still"))
         found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
-        held_m, drift_m = _moved_after(seen, rest, end)
-        if held_m > STANDSTILL_M and not drawn.pushed:
+        held_m, drift_m = _moved_after(seen, stands, end)
+        if rest is not None and not drawn.pushed:
+            settled_m = float(np.abs(position[rest:stands] - position[rest]).max(initial=0.0))
+            if settled_m > SETTLING_M:
+                found.append((STANDSTILL, f"macro moved {settled_m * 1e6:.0f} um while it settled"))
+        if held_m > STANDSTILL_M:
             found.append((STANDSTILL, f"macro moved {held_m * 1e6:.0f} um after standstill, with power"))
         if noticed is not None and not dark:
             begun = _begun_cycles(seen, record, noticed, facts.judged_until_t_ns)
             if not begun <= BEGUN_CYCLES:
                 found.append((BEGUN, f"stop begun {begun:.0f} cycles after detection"))
-    lost = _cycles_lost(facts, record)
+    lost = _cycles_lost(facts, record, rests)
     if lost:
         found.append((LOST, f"{lost} cycles on the bus have no row"))
     found += [(UNREADABLE, text) for text in record.unreadable]
@@ -149,11 +176,15 @@ def judge(drawn: Drawn, facts: Facts, record: Record) -> Verdict:
 
 
 def _bound_m(t_ns: np.ndarray, velocity: np.ndarray, at: int, detection_s: float) -> float:
-    before = max(at - 10, 0)
+    """Return how far the macro may go from sample `at` on."""
+    before = max(at - SLOPE_SAMPLES, 0)
     span_s = 1e-9 * float(t_ns[at] - t_ns[before]) or CYCLE_S
     a = abs(float(velocity[at] - velocity[before])) / span_s
     t = detection_s + CYCLE_S
-    a = min(a + PLAN_M_PER_S3 * t, max(a, PLAN_M_PER_S2))
+    until = max(int(np.searchsorted(t_ns, t_ns[at] + round(1e9 * t))), at + 1)
+    speed = np.abs(velocity[before:until])
+    gained = float(((speed[SLOPE_SAMPLES:] - speed[:-SLOPE_SAMPLES]) / (SLOPE_SAMPLES * CYCLE_S)).max(initial=0.0))
+    a = max(a, min(a + PLAN_M_PER_S3 * t, PLAN_M_PER_S2, gained))
     v = abs(float(velocity[at]))
     return v * t + 0.5 * a * t * t + (v + a * t) ** 2 / (2.0 * RAMP_M_PER_S2)
 
@@ -176,7 +207,7 @@ def _rest(seen: dict[str, Any], at: int, end: int, noticed_t_ns: int | None) -> 
     first = min(starts)
     slow = np.concatenate([[0], np.cumsum(np.abs(velocity[first:]) < REST_M_PER_S)])
     found = np.flatnonzero(slow[REST_SAMPLES:] - slow[:-REST_SAMPLES] == REST_SAMPLES)[:1].tolist()
-    let_go = ~np.isin(states[first:], _POWERED) & (np.abs(velocity[first:]) < LET_GO_M_PER_S)
+    let_go = ~np.isin(states[first:], _POWERED) & (np.abs(velocity[first:]) < REST_M_PER_S)
     found += np.flatnonzero(let_go)[:1].tolist()
     return at + first + min(found) if found else None
 
@@ -191,11 +222,18 @@ def _enabled_again(seen: dict[str, Any], at: int, end: int) -> list[str]:
     return found
 
 
-def _moved_after(seen: dict[str, Any], rest: int | None, end: int) -> tuple[float, float]:
+def _stands(seen: dict[str, Any], rest: int | None, end: int) -> int:
+    """Return the sample from which on the macro must not move: its drive's loop has settled, or its power is gone."""
+    if rest is None:
+        return end
+    off = np.flatnonzero(~np.isin(seen["states"][rest:end, 0], _POWERED))
+    return min(rest + SETTLED_SAMPLES, rest + int(off[0]) + 1 if off.size else end, end)
+
+
+def _moved_after(seen: dict[str, Any], stands: int, end: int) -> tuple[float, float]:
     """Return how far the macro moved with power after it stood, and how far without: that is a drift, not judged."""
-    if rest is None or rest + SETTLED_SAMPLES >= end:
+    if stands >= end:
         return 0.0, 0.0
-    stands = rest + SETTLED_SAMPLES
     powered = np.isin(seen["states"][stands:end, 0], _POWERED)
     moved_m = np.abs(seen["macro_position_m"][stands:end] - seen["macro_position_m"][stands])
     off = np.flatnonzero(~powered)
@@ -221,14 +259,31 @@ def _begun_cycles(seen: dict[str, Any], record: Record, noticed_t_ns: int, until
     return max(0.0, np.ceil(drive_s / CYCLE_S - 1.0))  # a state is seen at the sample after it changed
 
 
-def _cycles_lost(facts: Facts, record: Record) -> int:
-    """Count SYNCs on the bus that no row stands for, from the motion's begin to the end of watching.
+def _cycles_lost(facts: Facts, record: Record, rests: int) -> int:
+    """Count SYNCs on the bus that no row stands for, from the motion's begin until the macro rests or has no power.
 
-    A cycle has one SYNC, behind its row's instant and before the next one's.
+    A cycle has one SYNC, behind its row's instant and before the next one's; a fault may hold it up beyond that. So a
+    cycle is lost where rows lie further apart than a cycle and more than one SYNC lies between, and at both ends.
     """
-    t_ns = record.columns["t_ns"]
+    t_ns, seen_t_ns = record.columns["t_ns"], facts.seen["t_ns"]
+    powered = np.flatnonzero(
+        np.isin(facts.seen["states"], _POWERED).any(axis=1) & (seen_t_ns <= facts.judged_until_t_ns)
+    )
+    until_t_ns = facts.begun_t_ns
+    if powered.size:
+        until_t_ns = int(min(seen_t_ns[powered[-1]], seen_t_ns[min(rests, seen_t_ns.size - 1)]))
     rows = t_ns[(t_ns >= facts.begun_t_ns) & (t_ns <= facts.judged_until_t_ns)]
     sync = np.unique(facts.sync_t_ns)  # one that a fault doubled comes at one instant
+    begun_t_ns = facts.begun_t_ns
+    if facts.phase == "homing":  # it has no run before it has power
+        first = np.flatnonzero(np.isin(facts.seen["states"], _POWERED).any(axis=1) & (seen_t_ns >= begun_t_ns))
+        begun_t_ns = int(seen_t_ns[first[0]]) if first.size else until_t_ns
     if not rows.size:
-        return int(((sync > facts.begun_t_ns) & (sync <= facts.judged_until_t_ns)).sum())
-    return max(0, int(((sync > rows[0]) & (sync <= rows[-1] + 1_000_000)).sum()) - rows.size)
+        return int(((sync > begun_t_ns) & (sync <= until_t_ns)).sum())
+    cycle_ns = round(1e9 * CYCLE_S)
+    places = np.searchsorted(sync, rows)
+    between = np.diff(places)
+    inside = int((between[np.diff(rows) > 1.5 * cycle_ns] - 1).clip(min=0).sum())
+    head = int(((sync > begun_t_ns) & (sync <= rows[0] - cycle_ns)).sum())
+    tail = int(((sync > rows[-1] + cycle_ns) & (sync <= until_t_ns)).sum())
+    return inside + head + tail

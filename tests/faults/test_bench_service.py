@@ -1,15 +1,17 @@
 """`python -m bench service`: what it makes of its runs, its journal, and its mutants."""
 
 import ast
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bench import service, service_batch
+from bench import service, service_batch, service_processes
 from bench.journal import Journal
-from bench.mutation import mutants, uncompiled
+from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
+from tests.faults import real
 from tests.faults.judge import BACK, LOST, TRAVEL
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,8 +66,23 @@ def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path, monkey
     assert Journal(None).entries == {}
 
 
+def test_the_bound_of_a_run_with_real_processes():
+    """t = 0.1 + 0.001 + 0.01 s at 0.12 m/s, ramp 5 m/s^2: 13.32 + 1.44 mm."""
+    moving = {"macro_velocity_m_per_s": -0.12, "macro_position_m": 0.05}
+    assert real._bound_m(real.KINDS["servo killed"], moving, 0.01) == pytest.approx(14.76e-3, abs=0.01e-3)
+    coasts = real._bound_m(real.KINDS["drive reboot"], moving, 0.01)
+    assert coasts == pytest.approx(0.05 + 0.17 + 0.008)
+
+
+def test_the_seeded_part_has_every_process_killed_and_stopped():
+    kinds = {list(real.KINDS)[seed % len(real.KINDS)] for seed in service_processes.SEEDS}
+    assert len(kinds) == len(service_processes.SEEDS) >= 10
+    struck = {f"{name} {how}" for name in ("servo", "supervisor") for how in ("killed", "stopped")}
+    assert struck | {"disk full", "two operators", "hostile API (schemathesis)", "client vanishes in mid jog"} <= kinds
+
+
 def test_parts_are_named():
-    assert {"batch", "mutants"} <= set(service.PARTS)
+    assert set(service.PARTS) == {"batch", "processes", "losses", "pages", "soak", "mutants"}
     with pytest.raises(SystemExit, match="choose from batch, "):
         list(service.figures(full=False, say=lambda text: None, part="nothing"))
 
@@ -103,6 +120,25 @@ def test_uncompiled_code_sees_fields_of_a_row():
     rows["cycle"] = 7
     assert step(rows[0], 2.5) == 7
     assert rows["force_n"][0] == 2.5
+
+
+def test_a_mutant_is_alive_where_no_test_notices_it():
+    """Three that the tests of the lease must see, and one that changes nothing."""
+    name, tests = "stagectl.service.lease", ["tests/service/test_lease_edges.py"]
+    made = {one.key: one for one in mutants((ROOT / "stagectl/service/lease.py").read_text())}
+    seen = [
+        made["Lease.left_s: max(self.until_s - now_s, 0.0) -> min(self.until_s - now_s, 0.0)"],
+        made["module: in GRACE_S = 1.0: 1.0 -> 2.0"],
+        made["take: now_s + duration_s -> now_s - duration_s"],
+    ]
+    nothing = replace(seen[0], replacement=seen[0].kept)
+    said = []
+    found = trial(name, [*seen, nothing], tests, 30.0, said.append)
+    assert found.alive == (3,)
+    assert found.tests_count > 20
+    assert len(said) == 1
+    with pytest.raises(RuntimeError, match="no test could be collected"):
+        trial(name, [nothing], ["tests/service/there_is_none.py"], 30.0, said.append)
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -11,7 +11,7 @@ from tests.faults.kinds import KINDS, SILENCE_S, Drawn
 from tests.faults.scene import Facts
 from tests.faults.witness import ENABLED
 
-SEEDS = (0, 8, 12)
+SEEDS = (8, 12, 46)  # 46: a macro position that stands still while the macro moves
 _STOPPED = 5  # QUICK_STOP_ACTIVE
 
 
@@ -96,6 +96,49 @@ def test_judges_see_a_stage_that_moves_again():
     assert bars_missed(facts, record) == {STANDSTILL}
 
 
+def test_judges_see_an_axis_that_is_let_go_of_before_it_rests():
+    facts, record = rest_after(2.0)
+    velocity = facts.seen["macro_velocity_m_per_s"]
+    coasts = np.arange(2000) > np.flatnonzero(velocity > 3e-3)[-1]
+    facts.seen["states"][coasts] = 1
+    velocity[coasts] = 3e-3
+    facts.seen["macro_position_m"] = np.cumsum(velocity) * 1e-3
+    assert bars_missed(facts, record) == {TRAVEL, STANDSTILL}
+
+
+def test_judges_see_a_drive_that_creeps_on_before_it_stands():
+    """What it does in the 0.2 s behind |v| < 1 mm/s is travel, and no more than a loop that settles."""
+    facts, record = rest_after(2.0)
+    facts.seen["macro_position_m"][1350:] += 3e-3
+    assert bars_missed(facts, record) == {TRAVEL, STANDSTILL}
+
+
+PUSHED = replace(FAULT, pushed=True, lasts_s=0.3)
+
+
+def test_an_obstacle_pushes_back_and_the_stop_s_own_end_is_all_that_it_comes_back_to():
+    facts, record = rest_after(2.0)
+    position = facts.seen["macro_position_m"]
+    ended_m = position[-1]
+    position[1250:1300] = ended_m - 4e-3  # against the wall, until it is gone at 1.3 s
+    assert bars_missed(facts, record) == {STANDSTILL}
+    assert bars_missed(facts, record, PUSHED) == set()
+    position[1300:] = ended_m + 4e-3
+    assert bars_missed(facts, record, PUSHED) == {TRAVEL}
+    position[1300:] = ended_m
+    position[1850:] += 30e-6
+    assert bars_missed(facts, record, PUSHED) == {STANDSTILL}
+
+
+def test_what_a_plan_may_gain_counts_only_where_speed_was_gained():
+    """0.3 s until it is noticed: at constant speed the plan's 0.9 m/s^2 is no excuse for another 70 mm."""
+    facts, record = rest_after(2.0, noticed_s=0.3)
+    slow = replace(FAULT, detection_s=0.3)
+    verdict = judge(slow, facts, record)
+    assert verdict.bound_m == pytest.approx(0.4 * 0.301 + 0.4**2 / 4.0, rel=0.01)
+    assert TRAVEL not in {bar for bar, _ in verdict.violations}
+
+
 def test_a_drift_without_power_is_measured_and_no_command():
     facts, record = rest_after(2.0)
     facts.seen["states"][1500:] = 1
@@ -111,6 +154,30 @@ def test_judges_see_cycles_without_a_row():
     verdict = judge(FAULT, facts, record)
     assert {bar for bar, _ in verdict.violations} == {LOST}
     assert verdict.cycles_lost == 3
+
+
+def test_rows_without_a_sync_hide_none_that_is_lost():
+    facts, record = rest_after(2.0)
+    facts.sync_t_ns = np.delete(facts.sync_t_ns, slice(1100, 1150))  # bus-off: rows go on
+    record.columns = {name: np.delete(values, slice(1200, 1203)) for name, values in record.columns.items()}
+    assert judge(FAULT, facts, record).cycles_lost == 3
+
+
+@pytest.mark.parametrize(("gone", "count"), [(slice(1180, 2000), 40), (slice(0, 520), 20)])
+def test_judges_see_a_run_without_its_end_or_its_begin(gone, count):
+    """The macro comes to rest at 1.22 s; the motion began at 0.5 s."""
+    facts, record = rest_after(2.0)
+    record.columns = {name: np.delete(values, gone) for name, values in record.columns.items()}
+    verdict = judge(FAULT, facts, record)
+    assert {bar for bar, _ in verdict.violations} == {LOST}
+    assert verdict.cycles_lost == pytest.approx(count, abs=2)
+
+
+def test_a_drive_that_is_enabled_again_is_seen_without_a_fault_too():
+    facts, record = rest_after(2.0)
+    facts.seen["states"][1700:1705, 1] = ENABLED
+    stopping = replace(facts, fault_kind="", phase="stopping")
+    assert STANDSTILL in bars_missed(stopping, record)
 
 
 def test_judges_see_what_should_not_have_happened():

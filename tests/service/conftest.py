@@ -17,12 +17,10 @@ def daemon(tmp_path_factory):
 
 @pytest.fixture
 def idle(daemon):
-    """The daemon without power, whatever the last test left."""
+    """The daemon without power, whatever the last test left, or the host did meanwhile."""
+    daemon.recovers()
     yield daemon
     daemon.until(lambda: daemon.client.status().state in ("idle", "fault", "off"), "rest")
-    status = daemon.client.status()
-    if status.fault is not None:
-        with daemon.client.lease("tidy"):
-            daemon.client.acknowledge(status.fault.number)
+    daemon.recovers()
     daemon.state_is("idle")
     daemon.until(lambda: daemon.client.lease_state() is None, "a free lease")

@@ -15,18 +15,27 @@ from stagectl.commands.jog_keys import FIRST_HOLD_S, NEXT_HOLD_S, Hand
 
 pytestmark = pytest.mark.real_time
 
+_MOTIONS = ("move", "jog", "scan", "follow", "stream")
 RIGHT, LEFT, UP = b"\x1b[C", b"\x1b[D", b"\x1b[A"
 
 
 @pytest.fixture
 def call(idle, capsys, monkeypatch):
-    """Run a command with --json against the daemon: (exit code, the object)."""
+    """Run a command with --json against the daemon: (exit code, the object); after a hiccup of the host once more."""
     monkeypatch.setenv("STAGECTL_SOCKET", str(idle.socket))
 
-    def run(*arguments):
+    def once(*arguments):
         capsys.readouterr()
         code = cli.main([*map(str, arguments), "--json"])
         return code, json.loads(capsys.readouterr().out)
+
+    def run(*arguments):
+        found = once(*arguments)
+        if arguments[0] not in _MOTIONS or found[0] == 0 or not idle.recovers():
+            return found
+        if arguments[0] == "stream":
+            sys.stdin.seek(0)
+        return once(*arguments)
 
     return run
 
@@ -131,15 +140,30 @@ def test_without_a_service_there_is_nothing_to_ask(call, monkeypatch, tmp_path):
         assert "is `stagectl serve` running?" in answer["error"]["message"]
 
 
-def test_keys_jog_while_they_are_held(idle):
-    before_m = idle.plant["macro_position_m"]
+def keys_jog(idle):
+    """Start `jog --keys` at a terminal of its own: (the terminal's other end, the process)."""
     leader, follower = pty.openpty()
     command = [sys.executable, "-m", "stagectl.cli", "jog", "--keys", "--velocity-m-per-s", "0.02"]
     jogging = subprocess.Popen(
         [*command, "--socket", str(idle.socket)], stdin=follower, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     )
     os.close(follower)
+    return leader, jogging
+
+
+def end(leader, jogging):
+    jogging.kill()
+    jogging.communicate()
+    os.close(leader)
+
+
+def test_keys_jog_while_they_are_held(idle):
+    before_m = idle.plant["macro_position_m"]
+    leader, jogging = keys_jog(idle)
     try:
+        if idle.state_is("armed", "fault") and idle.recovers():
+            end(leader, jogging)
+            leader, jogging = keys_jog(idle)
         idle.state_is("armed")
         until_s = time.monotonic() + 1.5
         while time.monotonic() < until_s:
@@ -150,9 +174,7 @@ def test_keys_jog_while_they_are_held(idle):
         os.write(leader, b"q")
         assert jogging.wait(30.0) == 0, jogging.stderr.read()
     finally:
-        jogging.kill()
-        jogging.communicate()
-        os.close(leader)
+        end(leader, jogging)
     assert -0.06 < moved_m < -0.01
 
 
