@@ -38,6 +38,7 @@ _NMT_NAMES = {
 }
 
 EMERGENCY_LOG_LENGTH = 256
+_ANSWER_S = 1.0  # of an SDO; canopen's 0.3 s is too short for a host that does something else
 _LACKING_SHOWN = 8  # of the objects that an EDS file lacks: more would bury the sentence
 RECEIVER_PERIOD_S = 0.1  # the receiver thread notices a close after this
 
@@ -120,7 +121,7 @@ class Master:
             self.network.subscribe(0x080 + node_id, self._on_emergency)
             self.network.subscribe(0x700 + node_id, self._on_heartbeat)
         # A reply that isn't there when `send` returns never comes: nobody else moves virtual time.
-        node.sdo.RESPONSE_TIMEOUT = 0.0 if self._synchronous else 0.3
+        node.sdo.RESPONSE_TIMEOUT = 0.0 if self._synchronous else _ANSWER_S
         self._nodes[node_id] = node
 
     def nmt(self, node_id: int, command: int | str) -> None:

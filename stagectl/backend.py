@@ -362,13 +362,13 @@ class RealtimeBackend:
     may_move = True
 
     def __init__(self, profile: Profile, name: str, vendor_id: int | None, interface: str, channel: str, port: str):
-        """Start warming a servo process; it opens nothing before `start_servo`."""
+        """Take what is needed; nothing is started or opened yet."""
         self.name, self.vendor_id = name, vendor_id
         self.description = f"{name}: CAN {interface} {channel}, interferometer {port}"
         self.remarks: list[str] = []
         self._interface, self._channel, self._port = interface, channel, port
-        self._servo = _Child("servo", [sys.executable, "-m", "stagectl.servo_process"])
-        self._servo.tell(profile.effective())
+        self._profile = profile
+        self._warming: _Child | None = None
         self._warm = False
         self._paths: dict[str, Path] = {}
 
@@ -383,6 +383,17 @@ class RealtimeBackend:
     def pause(self, duration_s: float) -> None:
         """Sleep."""
         time.sleep(duration_s)
+
+    @property
+    def _servo(self) -> _Child:
+        """The servo's process, begun where it wasn't: it compiles or loads everything, and opens nothing.
+
+        Not before somebody needs it: a stage whose drives are silent would load one at each try, seconds of a CPU.
+        """
+        if self._warming is None:
+            self._warming = _Child("servo", [sys.executable, "-m", "stagectl.servo_process"])
+            self._warming.tell(self._profile.effective())
+        return self._warming
 
     @property
     def servo_pid(self) -> int:
@@ -458,7 +469,8 @@ class RealtimeBackend:
 
     def close(self) -> None:
         """End the servo and remove the shared memory; rows that nobody drained stay for the next start."""
-        self._servo.stop()
+        if self._warming is not None:
+            self._warming.stop()
         for name, path in self._paths.items():
             if name != "ring":
                 path.unlink(missing_ok=True)
@@ -519,6 +531,7 @@ class RigBackend(RealtimeBackend):
         command += ["--seed", str(seed), "--truth", str(self._truth_path), "--linger-s", str(linger_s)]
         self._rig = _Child("rig", command)
         try:
+            _ = self._servo  # begun now, for both to compile side by side
             self._rig.hear(_WARM_TIMEOUT_S)
         except BaseException:
             self.close()

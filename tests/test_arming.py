@@ -13,6 +13,7 @@ import canopen
 import pytest
 from canopen.sdo.exceptions import SdoAbortedError
 
+from drivers import cia402
 from drivers.arming import (
     DriveSettings,
     StaleTorque,
@@ -536,6 +537,21 @@ def test_unused_pdos_are_switched_off(tmp_path):
     assert bench.macro.data_store[0x1401][1] == bytes.fromhex("01030080")
     assert bench.macro.data_store[0x1802][1] == bytes.fromhex("81030080")
     bench.close()
+
+
+def test_a_drive_may_take_half_a_second_to_answer():
+    """A host under load, or a drive that writes its flash: no reason to give up."""
+    network = canopen.Network()
+    network.connect(interface="virtual", channel="slow-drive")
+    drive = network.create_node(Drive(1, EDS_LINEAR))
+    drive.add_read_callback(lambda index, subindex, od: time.sleep(0.5))
+    master = Master(can.Bus(interface="virtual", channel="slow-drive"))
+    try:
+        master.add_node(1, EDS_LINEAR)
+        assert master.read(1, cia402.IDENTITY, 0) == 4
+    finally:
+        master.close()
+        network.disconnect()
 
 
 def test_silent_node_is_a_link_error(bench):

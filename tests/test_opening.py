@@ -1,8 +1,27 @@
 """Opening a stage: what a world needs to be there."""
 
+import os
+from pathlib import Path
+
+import pytest
+
+from sim_backend.hub import Hub
+from stagectl.errors import LinkError
 from stagectl.profile import PROFILES_FOLDER, load_profile
 from stagectl.stage import open_stage
 from tests.toml_text import changed
+
+
+def servos_count() -> int:
+    """Count the servo processes that are children of this one."""
+    count = 0
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent_pid = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            count += parent_pid == os.getpid() and b"stagectl.servo_process" in (folder / "cmdline").read_bytes()
+        except OSError:
+            continue  # it has ended
+    return count
 
 
 def test_hardware_needs_no_machine_file(tmp_path):
@@ -14,3 +33,20 @@ def test_hardware_needs_no_machine_file(tmp_path):
         assert stage.backend.name == "hardware"
     finally:
         stage.backend.close()
+
+
+def test_drives_that_are_silent_cost_no_servo(tmp_path):
+    """The service tries again every five seconds, for hours: loading a servo each time would take half a CPU."""
+    path, channel = tmp_path / "silent.toml", str(tmp_path / "can.socket")
+    changes = {"name": "silent", "can.interface": "hub", "can.channel": channel}
+    path.write_text(changed(PROFILES_FOLDER / "single-axis.toml", changes))
+    hub = Hub(channel)
+    try:
+        stage = open_stage(load_profile(str(path)), "hardware", runs_root=tmp_path / "runs", name="opened")
+        assert servos_count() == 0
+        with pytest.raises(LinkError, match="No SDO response"):
+            stage.connect()
+        assert servos_count() == 0
+    finally:
+        stage.backend.close()
+        hub.close()
