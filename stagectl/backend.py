@@ -384,9 +384,8 @@ class RealtimeBackend:
         """Sleep."""
         time.sleep(duration_s)
 
-    @property
     def _servo(self) -> _Child:
-        """The servo's process, begun where it wasn't: it compiles or loads everything, and opens nothing.
+        """Return the servo's process, begun where it wasn't: it compiles or loads everything, and opens nothing.
 
         Not before somebody needs it: a stage whose drives are silent would load one at each try, seconds of a CPU.
         """
@@ -398,12 +397,12 @@ class RealtimeBackend:
     @property
     def servo_pid(self) -> int:
         """Process id of the servo."""
-        return self._servo.process.pid
+        return self._servo().process.pid
 
     def wait_warm(self) -> None:
         """Wait until the servo has compiled or loaded everything."""
         if not self._warm:
-            self._servo.hear(_WARM_TIMEOUT_S)
+            self._servo().hear(_WARM_TIMEOUT_S)
             self._warm = True
 
     def start_servo(self, profile: Profile, mappings: Mapping[str, DriveMapping], run_folder: Path) -> ServoLink:
@@ -416,7 +415,7 @@ class RealtimeBackend:
         segments = np.memmap(paths["segments"], dtype=SETPOINT, mode="w+", shape=(SEGMENT_ROWS,))
         requests = RequestWriter(paths["requests"], REQUEST)
         cpus = sorted(os.sched_getaffinity(0))
-        self._servo.tell(
+        self._servo().tell(
             {
                 "profile": profile.effective(),
                 "mappings": {axis: describe_mapping(mapping) for axis, mapping in mappings.items()},
@@ -429,7 +428,7 @@ class RealtimeBackend:
                 **{name: str(path) for name, path in paths.items()},
             }
         )
-        answer = self._servo.hear(_SERVO_START_TIMEOUT_S)
+        answer = self._servo().hear(_SERVO_START_TIMEOUT_S)
         self.remarks = [f"the host refused the servo {what}" for what in answer["refused"]] + answer["warnings"]
         tracker_belief = estimator.belief(profile)
         snapshot = {**WireDecoder(profile, mappings).snapshot(), "belief": tracker_belief}
@@ -449,9 +448,9 @@ class RealtimeBackend:
     def _pass_time(self, duration_s: float) -> None:
         """Sleep; LinkError where the servo has died meanwhile."""
         time.sleep(duration_s)
-        if not self._servo.running:
+        if not self._servo().running:
             raise LinkError(
-                f"the servo process ended with {self._servo.process.returncode}; the drives stop the stage by "
+                f"the servo process ended with {self._servo().process.returncode}; the drives stop the stage by "
                 "themselves; its last cycles are in the run"
             )
 
@@ -459,9 +458,9 @@ class RealtimeBackend:
         """Ask the servo to exit and wait for it."""
         requests.publish({"counter": 1 << 40, "mode": int(Mode.EXIT)})
         try:
-            self._servo.process.wait(_END_S)
+            self._servo().process.wait(_END_S)
         except subprocess.TimeoutExpired:
-            self._servo.stop()
+            self._servo().stop()
 
     def truth(self) -> dict[str, np.ndarray] | None:
         """Nobody knows what is true of a machine."""
@@ -531,7 +530,7 @@ class RigBackend(RealtimeBackend):
         command += ["--seed", str(seed), "--truth", str(self._truth_path), "--linger-s", str(linger_s)]
         self._rig = _Child("rig", command)
         try:
-            _ = self._servo  # begun now, for both to compile side by side
+            self._servo()  # begun now, for both to compile side by side
             self._rig.hear(_WARM_TIMEOUT_S)
         except BaseException:
             self.close()
