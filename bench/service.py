@@ -17,12 +17,12 @@ ABOUT = (
 Say = Callable[[str], None]
 
 PARTS: dict[str, Callable[..., Iterator[Figure]]] = {
+    "mutants": service_mutants.figures,  # first: its modules are to be imported uncompiled
     "batch": service_batch.figures,
     "processes": service_processes.figures,
     "losses": service_processes.loss_figures,
     "pages": ten_pages.figures,
     "soak": service_processes.soak_figures,
-    "mutants": service_mutants.figures,
 }
 """By the name that `--part` takes."""
 

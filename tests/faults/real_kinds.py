@@ -167,10 +167,9 @@ def hostile_api(house: House) -> None:
 
 def full_disk(house: House) -> None:
     """Leave no byte on the disk that the runs are on."""
-    with (house.daemon.runs.parent / "filler").open("wb") as file, contextlib.suppress(OSError):
+    with contextlib.suppress(OSError), (house.daemon.runs.parent / "filler").open("wb", buffering=0) as file:
         while True:
             file.write(bytes(1 << 16))
-            file.flush()
     _later(1.5, lambda: (house.daemon.runs.parent / "filler").unlink(missing_ok=True))
 
 
