@@ -87,7 +87,9 @@ def init(profile: "Profile", *, has_drives: bool) -> np.ndarray:
     period_s = 1.0 / profile.cycle.rate_hz
     g["period_s"] = period_s
     g["has_drives"] = float(has_drives)
-    g["travel_low_m"], g["travel_high_m"] = macro.travel_m
+    # Where the reference may go; the macro strays from it, at most as far as the end may from its own.
+    g["travel_low_m"] = macro.travel_m[0] - profile.control.error_limit_m
+    g["travel_high_m"] = macro.travel_m[1] + profile.control.error_limit_m
     g["velocity_limit_m_per_s"] = macro.velocity_limit_m_per_s
     g["stop_deceleration_m_per_s2"] = macro.stop_deceleration_m_per_s2
     g["macro_force_limit_n"] = macro.force_limit_n

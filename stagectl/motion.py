@@ -33,12 +33,22 @@ def planned_limits(profile: Profile) -> trajectories.Limits:
     return trajectories.Limits(PLAN_SHARE * macro.velocity_limit_m_per_s, acceleration, acceleration / _JERK_TIME_S)
 
 
+def travel_from(start_m: float, profile: Profile) -> tuple[float, float]:
+    """Return where a motion may go that begins at `start_m`: within the travel, or no further out than it stands.
+
+    A stage at the end of its travel rests some nanometres beyond it; it is let back in from wherever the guard lets it
+    be.
+    """
+    (low_m, high_m), stray_m = profile.macro.travel_m, profile.control.error_limit_m
+    return min(low_m, max(start_m, low_m - stray_m)), max(high_m, min(start_m, high_m + stray_m))
+
+
 def check(planned: trajectories.Trajectory, profile: Profile) -> None:
     """Refuse what a stage of this profile can't follow: RequestError names instant, value, limit and remedy."""
-    macro = profile.macro
+    macro, position_m = profile.macro, planned.setpoints["position_m"]
     trajectories.check(
         planned,
-        macro.travel_m,
+        travel_from(float(position_m[0]), profile) if position_m.size else macro.travel_m,
         macro.velocity_limit_m_per_s,
         macro.acceleration_limit_m_per_s2,
         stop_deceleration_m_per_s2=macro.stop_deceleration_m_per_s2,

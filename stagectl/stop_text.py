@@ -41,7 +41,8 @@ def stop_detail(stop: Stop, m: Any, now: Any, command: Any, g: Any, node_ids: di
 
 def _travel(m: Any, now: Any, g: Any) -> str:
     return (
-        f"macro at {m['macro_position_m']:.5f} m, travel {g['travel_low_m']:g} .. {g['travel_high_m']:g} m; "
+        f"macro at {m['macro_position_m']:.5f} m, travel and following error allow {g['travel_low_m']:g} .. "
+        f"{g['travel_high_m']:g} m; "
         "move it back by hand, then home"
     )
 
@@ -53,7 +54,8 @@ def _velocity(m: Any, now: Any, g: Any) -> str:
     rest_m = x + 0.5 * v * abs(v) / float(g["stop_deceleration_m_per_s2"])
     end_m = g["travel_high_m"] if v > 0.0 else g["travel_low_m"]
     return (
-        f"macro at {x:.5f} m with {v:.4f} m/s would come to rest at {rest_m:.5f} m, travel ends at {end_m:g} m; "
+        f"macro at {x:.5f} m with {v:.4f} m/s would come to rest at {rest_m:.5f} m, "
+        f"travel and following error end at {end_m:g} m; "
         "slow down before the end"
     )
 

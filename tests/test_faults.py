@@ -215,7 +215,8 @@ CASES = {
     "too fast for the way left": Case(
         inject(),
         Stop.VELOCITY,
-        r"macro at 0\.0\d+ m with 0\.\d+ m/s would come to rest at 0\.0[67]\d+ m, travel ends at 0\.07 m",
+        r"macro at 0\.0\d+ m with 0\.\d+ m/s would come to rest at 0\.0[67]\d+ m, "
+        r"travel and following error end at 0\.0702 m",
         guided=True,
         profile={"macro__travel_m": (-0.05, 0.07)},
     ),
@@ -485,7 +486,8 @@ def test_a_stage_outside_its_travel_is_not_moved(tmp_path, oled_profile, oled_ma
     one = Stage(tmp_path / "run", profile, oled_machine)
     with one:
         assert one.stage.enable() is Stop.TRAVEL
-        assert re.search(r"macro at 0\.01\d+ m, travel -0\.4 \.\. 0\.005 m; move it back", one.stage.detail)
+        said = r"macro at 0\.01\d+ m, travel and following error allow -0\.4002 \.\. 0\.0052 m; move it back"
+        assert re.search(said, one.stage.detail)
     assert replay(tmp_path / "run").exact
 
 

@@ -127,7 +127,7 @@ def test_how_far_ahead_a_sample_may_lie_is_the_profiles_period(oled_profile):
     assert Cycle(slow).set(sample_t_ns=10**12 + 5 * MS // 2 + 1).stop() is Stop.SAMPLE_AHEAD
 
 
-@pytest.mark.parametrize("edge_m", [-0.45, 0.45])
+@pytest.mark.parametrize("edge_m", [-0.4502, 0.4502])  # the travel, and the following error beyond it
 def test_travel(oled_profile, edge_m):
     for share, code in ((0.99999, Stop.NONE), (1.0, Stop.NONE), (1.00001, Stop.TRAVEL)):
         at_m = edge_m * share
@@ -424,7 +424,7 @@ def test_a_sync_that_did_not_go_out_has_no_answer(cycle):
 
 def test_limits_are_the_profiles(oled_profile):
     g = guard.init(oled_profile, has_drives=True)[0]
-    assert (g["travel_low_m"], g["travel_high_m"], g["velocity_limit_m_per_s"]) == (-0.45, 0.45, 0.5)
+    assert (g["travel_low_m"], g["travel_high_m"], g["velocity_limit_m_per_s"]) == (-0.4502, 0.4502, 0.5)
     assert (g["macro_force_limit_n"], g["micro_force_limit_n"], g["following_error_m"]) == (2000.0, 180.0, 200e-6)
     assert (g["stop_deceleration_m_per_s2"], g["sensor_age_ns"], g["overrun_ns"]) == (2.0, 20e6, 20e6)
     assert (g["macro_thermal_n"], g["micro_thermal_n"]) == (700.0, 60.0)

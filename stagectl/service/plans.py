@@ -9,7 +9,7 @@ from stagectl import scan, suspected_units
 from stagectl import trajectory as trajectories
 from stagectl.backend import SEGMENT_ROWS
 from stagectl.errors import RequestError
-from stagectl.motion import check, planned_limits
+from stagectl.motion import check, planned_limits, travel_from
 from stagectl.profile import Profile
 from stagectl.service import messages
 from stagectl.streaming import Room, SetpointBuffer
@@ -68,7 +68,7 @@ def followed(body: messages.Follow, profile: Profile) -> Plan:
 def streamed(body: messages.Setpoints, profile: Profile, holds_m: float) -> Plan:
     """Begin a stream with its first set-points. Errors: RequestError with number, value, limit, remedy."""
     macro = profile.macro
-    room = Room(macro.travel_m, planned_limits(profile), macro.stop_deceleration_m_per_s2)
+    room = Room(travel_from(holds_m, profile), planned_limits(profile), macro.stop_deceleration_m_per_s2)
     buffer = SetpointBuffer(holds_m, body.period_s, room, profile.cycle.period_s)
     buffer.take(0, body.position_m, body.last)
     return Plan(buffer)
