@@ -73,6 +73,14 @@ def _load() -> str:
     return f"{one:.2f} / {five:.2f} / {fifteen:.2f}"
 
 
+def _write(text: str, out: Path | None) -> None:
+    """Print, and append to a file."""
+    print(text, flush=True)
+    if out is not None:
+        with out.open("a") as file:
+            file.write(text + "\n")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Measure, print, judge."""
     arguments = _arguments(argv)
@@ -80,15 +88,18 @@ def main(argv: list[str] | None = None) -> int:
     module = importlib.import_module(f"bench.{arguments.name}")
     chosen = {name: value for name in ("seed", "part") if (value := getattr(arguments, name)) is not None}
     say = partial(print, file=sys.stderr, flush=True)
-    figures = list(module.figures(full=arguments.full, say=say, **chosen))
-    load = f"Load average of the host (1 / 5 / 15 min): {load} before, {_load()} after."
-    if arguments.json:
-        text = "\n".join(json.dumps(figure.as_json()) for figure in figures)
-    else:
-        text = f"{table(figures)}\n{load}"
-    print(text)
     if arguments.out is not None:
-        arguments.out.write_text(text + "\n")
+        arguments.out.write_text("")
+    figures = []
+    for figure in module.figures(full=arguments.full, say=say, **chosen):  # said at once: a crash takes none along
+        figures.append(figure)
+        if arguments.json:
+            _write(json.dumps(figure.as_json()), arguments.out)
+        else:
+            say(f"{figure.figure}: {_value(figure)} {_verdict(figure)}")
+    load = f"Load average of the host (1 / 5 / 15 min): {load} before, {_load()} after."
+    if not arguments.json:
+        _write(f"{table(figures)}\n{load}", arguments.out)
     if arguments.markdown is not None:
         arguments.markdown.parent.mkdir(parents=True, exist_ok=True)
         arguments.markdown.write_text(_page(arguments.name, module.ABOUT, figures, load, time.monotonic() - begin_s))
