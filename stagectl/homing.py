@@ -4,7 +4,7 @@ import math
 
 from drivers import cia402
 from stagectl import trajectory as trajectories
-from stagectl.backlash import HOLD_RATIO
+from stagectl.backlash import HOLD_RATIO, filter_time_s
 from stagectl.errors import DriveError, RequestError
 from stagectl.outcome import BacklashEstimate, Outcome
 from stagectl.requests import Mode, Phase
@@ -206,7 +206,7 @@ class Homing(StreamMotion):
         joint = Joint(
             damping_n_s_per_m=contact_damping_n_s_per_m(self.profile.effects),
             touch_force_n=self.profile.backlash.touch_force_n,
-            hold_s=HOLD_RATIO * self.profile.backlash.filter_s,
+            hold_s=HOLD_RATIO * filter_time_s(self.profile),
             **{name: float(self._belief[name][0]) for name in _JOINT},
         )
         planned = trajectories.sweep(

@@ -16,6 +16,7 @@ import numpy as np
 from stagectl import compose, estimator, notch, plant
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
+from stagectl.laws.reference import gap_centre
 from stagectl.signals import SETPOINT
 from stagectl.tick import LAWS, Controller, controller
 
@@ -291,6 +292,10 @@ def _tick_map(
         if name in (one.law.dtype.names or ()):
             one.law[name] = 1.0
     one.setpoint[...] = np.zeros(1, SETPOINT)
+    if len(axes) == 2:
+        # The reference is where the stage is: 7.5 mm beside it the macro's force is at its limit, and stays there.
+        x_b = one.model["macro_position_m"] - one.model["end_position_m"]
+        one.setpoint["relative_position_m"] = float(gap_centre(one.belief[0])) - x_b
     one.measurement["cycle"] = one.measurement["sequence"] = one.measurement["samples_new"] = 1
     one.measurement["lease_left_ns"] = 1_000_000_000
     places = [(one.model, name) for name in _MODEL_STATES if _of_axes(name, axes)]

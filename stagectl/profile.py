@@ -247,7 +247,7 @@ class Backlash(Table):
     right_stiffness_n_per_m: Stiffness
     width_sd_m: Annotated[float, within(0.0, 1.0)]
     touch_force_n: Annotated[float, above(0.0, TOUCH_FORCE_LIMIT_N)]
-    filter_s: Annotated[float, within(1e-3, 1.0)] = 0.015  # of the identification, the same for all its terms
+    filter_s: Annotated[float, within(1e-3, 1.0)] | None = None  # of the identification; None: the noise's own
 
     @model_validator(mode="after")
     def _check_width(self) -> "Backlash":

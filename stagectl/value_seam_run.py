@@ -112,7 +112,7 @@ def sweep_setpoints(
         joint.right_stiffness_n_per_m,
         contact_damping_n_s_per_m(profile.effects),
         joint.touch_force_n,
-        backlash.HOLD_RATIO * joint.filter_s,
+        backlash.HOLD_RATIO * backlash.filter_time_s(profile),
     )
     planned = plan(believed, force_share, usual_hz, duration_s, asked_hz)
     return sweep(*planned, dt_s=profile.cycle.period_s).setpoints

@@ -64,6 +64,19 @@ def test_contact_is_the_spring_between_the_masses():
         assert apart == pytest.approx(math.cos(math.sqrt(w2) * 1e-3), abs=1e-7)
 
 
+@pytest.mark.parametrize("law", ["dsmc", "pid"])
+def test_in_contact_the_reference_is_where_the_stage_is(law):
+    """7.5 mm beside it the macro would be at its limit, and its integral would stand still: a pole at 1."""
+    profile = load_profile("kang-2023")
+    gap, left, right = (linearise(profile, law, believed_body(profile), place) for place in (GAP, LEFT, RIGHT))
+    in_gap = margins.margins(gap)
+    for one in (left, right):
+        found = margins.margins(one)
+        assert found.is_stable
+        assert found.sensitivity_peak_ratio == pytest.approx(in_gap.sensitivity_peak_ratio, rel=0.02)
+        assert found.crossover_hz == pytest.approx(in_gap.crossover_hz, rel=0.01)
+
+
 # ---- margins, of a loop that has closed forms ---------------------------------------------------------------------
 
 

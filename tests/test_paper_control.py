@@ -5,7 +5,15 @@ import pytest
 from scipy import signal
 
 from stagectl.laws.dsmc import integrand
-from stagectl.paper import cases, closed_loop, compensation, plant_as_printed, sliding_mode, sliding_mode_chapter
+from stagectl.paper import (
+    cases,
+    closed_loop,
+    compensation,
+    plant_as_printed,
+    ratchet,
+    sliding_mode,
+    sliding_mode_chapter,
+)
 from stagectl.paper.cases import Setting, macro_peak_m, stable_range_m
 from stagectl.paper.printed_values import CONTROL_5_3, SlidingModeValues
 
@@ -132,6 +140,19 @@ def test_the_printed_law_ends_at_the_artefact_and_the_corrected_one_does_not():
     damped["eta_per_s"] = 2.0 * np.sqrt(CONTROL_5_3.gamma_per_s2)
     rest = cases.sliding("sine", damped, Setting())
     assert np.mean(rest.error_m[rest.after(8.0)]) == pytest.approx(0.5 * PHI, rel=0.02)
+
+
+def test_noise_alone_carries_the_printed_bound_up_by_the_mean_square_of_s():
+    once, tenfold = (ratchet.at_rest(sliding_mode_chapter._ratcheting(), 30.0, noise_m) for noise_m in (5e-9, 50e-9))
+    c = CONTROL_5_3
+    differences = 2.0 * (5e-9 / 1e-3) ** 2  # of white samples, m^2/s^2
+    white_n_per_h = 3600.0 * c.alpha * c.k / c.r * differences
+    assert white_n_per_h < once.rate_n_per_h < 1.1 * white_n_per_h  # the stage moves a little as well
+    assert abs(tenfold.rate_n_per_h / once.rate_n_per_h - 100.0) < 1.0
+    assert once.half_width_n_per_h < 0.05 * once.rate_n_per_h
+    leaking = ratchet.at_rest(sliding_mode.corrected(), 30.0)
+    assert abs(leaking.rate_n_per_h) < 2.0 * leaking.half_width_n_per_h < 0.02 * once.rate_n_per_h
+    assert 0.0 < leaking.last_bound_n - c.first_bound_n < 1e-6
 
 
 def test_the_printed_adaptive_law_is_a_ratchet():

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from stagectl.commands.answer import Answer, Voice
 from stagectl.errors import RequestError
-from stagectl.paper.chapters import MISSING, asked, work_through
+from stagectl.paper.chapters import BEYOND, asked, work_through
 from stagectl.paper.page import cells, page
 from stagectl.paper.rows import Chapter
 
@@ -21,8 +21,7 @@ def show(voice: Voice, section: str | None, out: Path) -> Answer:
     _make_folder(out)
     chapters = work_through(names, voice.progress)
     voice.progress("drawing the page", 0.0)
-    missing = MISSING if section is None else ()
-    page(chapters, missing).write(out / PAGE)
+    page(chapters, BEYOND if section is None else ()).write(out / PAGE)
     voice.progress.done()
     data = {
         "sections": [
@@ -35,13 +34,12 @@ def show(voice: Voice, section: str | None, out: Path) -> Answer:
             }
             for chapter in chapters
         ],
-        "missing": list(missing),
         "page": str(out / PAGE),
     }
     shown = [
         part for chapter in chapters for part in (f"\n[bold]{chapter.section}. {chapter.title}[/]", _table(chapter))
     ]
-    return Answer(data, [*shown, *(f"not yet: {what}" for what in missing), f"page: {out / PAGE}"])
+    return Answer(data, [*shown, f"page: {out / PAGE}"])
 
 
 def _make_folder(out: Path) -> None:

@@ -54,8 +54,8 @@ def backlash() -> Backlash:
     return Backlash(half, half, TABLE_2.left_stiffness_n_per_m, TABLE_2.right_stiffness_n_per_m)
 
 
-def _prepared(setting: Setting) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Make plant, loop and decoupler of a setting."""
+def prepared(setting: Setting) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return plant, loop and decoupler of a setting."""
     plant = plant_as_printed.parameters(backlash())
     plant["drive"] = setting.drive
     plant["relative_inertia"] = setting.relative_inertia
@@ -82,14 +82,14 @@ def _state(reference: Reference, setting: Setting) -> np.ndarray:
 
 def sliding(name: str, law: np.ndarray, setting: Setting) -> Run:
     """Follow a reference of section 5.3 with the sliding mode on the micro."""
-    plant, loop, decoupler = _prepared(setting)
+    plant, loop, decoupler = prepared(setting)
     reference = REFERENCES[name](setting.period_s)
     return closed_loop.run(plant, loop, reference, law=law, decoupler=decoupler, state=_state(reference, setting))
 
 
 def printed_pid(name: str) -> Run:
     """Case A: P_w, I_w, D_w as volts per metre, P_h as a gain on the macro's position command."""
-    plant, loop, _ = _prepared(Setting(macro_gain_ratio=PID_5_3["P_h"]))
+    plant, loop, _ = prepared(Setting(macro_gain_ratio=PID_5_3["P_h"]))
     loop["micro_law"] = closed_loop.MICRO_PID
     loop["proportional_v_per_m"] = PID_5_3["P_w"]
     loop["integral_v_per_m_s"] = PID_5_3["I_w"]
@@ -99,7 +99,7 @@ def printed_pid(name: str) -> Run:
 
 def fair_pid(name: str) -> Run:
     """Case A': the same PID with gains of a micro that can carry itself, a triple pole at 10 Hz; no compensation."""
-    plant, loop, _ = _prepared(Setting())
+    plant, loop, _ = prepared(Setting())
     q = plant[0]
     w = 2.0 * np.pi * _FAIR_PID_HZ
     volts_per_newton = float(q["micro_resistance_ohm"] / q["micro_force_constant_n_per_a"])

@@ -19,11 +19,13 @@ CHAPTERS = {
 }
 """Name as typed: (section of the paper, what it is about)."""
 
-MISSING = (
-    "how far noise alone ratchets (40) up in hours",
-    "what goes beyond the paper: identification while an ordinary motion runs, wear, and control at the limit",
+BEYOND = (
+    "Identification while an ordinary motion runs, of wear, of soft contacts and at the limit of the sensors; control "
+    "at the limit, with margins, flexible modes and a computed bound: `python -m bench paper` measures them, bar by "
+    "bar. Figures of one commit are in docs/figures-paper.md.",
+    "What an error of a stage of one's own is made of, and how far it is from the bound: `stagectl budget PROFILE`.",
 )
-"""What of the paper is not worked through yet."""
+"""What the paper has no equation, table, figure or claim of, and where it is measured."""
 
 
 def asked(section: str | None) -> tuple[str, ...]:

@@ -2,7 +2,8 @@
 
 The paper's macro law is "P_h": a gain on a position command, so an inner servo of stated bandwidth follows P_h d_r,
 with the reference's acceleration fed forward for m1 and the back-EMF made up for. Laws see positions and velocities
-as they are. Pure; knows neither cases nor numbers of the paper.
+as they are; where noise is given, positions with it, and velocities as their differences. Pure; knows neither cases
+nor numbers of the paper.
 """
 
 from dataclasses import dataclass
@@ -169,6 +170,20 @@ def _macro_input(loop: Record, decoupler: Record, s: Record, q: Record, at: np.n
 
 
 @compiled
+def _sense(seen: Record, s: Record, noise_m: np.ndarray, k: int, dt_s: float) -> None:
+    """Write what the laws see at sample `k` into positions and velocities of `seen`."""
+    macro_m, end_m = s.macro_position_m, s.end_position_m
+    seen.macro_velocity_m_per_s, seen.end_velocity_m_per_s = s.macro_velocity_m_per_s, s.end_velocity_m_per_s
+    if noise_m.shape[0] > 0:
+        macro_m += noise_m[k, 0]
+        end_m += noise_m[k, 1]
+        if k > 0:
+            seen.macro_velocity_m_per_s = (macro_m - seen.macro_position_m) / dt_s
+            seen.end_velocity_m_per_s = (end_m - seen.end_position_m) / dt_s
+    seen.macro_position_m, seen.end_position_m = macro_m, end_m
+
+
+@compiled
 def _run(
     state: np.ndarray,
     parameters: np.ndarray,
@@ -177,14 +192,18 @@ def _run(
     decouplers: np.ndarray,
     reference: np.ndarray,
     relative: np.ndarray,
+    noise_m: np.ndarray,
     out: np.ndarray,
 ) -> int:
     """Fill a row a control period; returns the rows up to which nothing left +-100 m."""
     s, q, loop, law, decoupler = state[0], parameters[0], loops[0], laws[0], decouplers[0]
     substeps = int(loop.substeps)
+    sensed = state.copy()
+    seen = sensed[0]
     for k in range(reference.shape[0]):
-        micro, saturated = _micro_input(loop, law, s, q, reference[k], relative[k])
-        macro = _macro_input(loop, decoupler, s, q, reference[k], micro)
+        _sense(seen, s, noise_m, k, loop.dt_s)
+        micro, saturated = _micro_input(loop, law, seen, q, reference[k], relative[k])
+        macro = _macro_input(loop, decoupler, seen, q, reference[k], micro)
         out[k, 0], out[k, 1], out[k, 2] = s.macro_position_m, s.end_position_m, s.contact_force_n
         out[k, 3], out[k, 4] = macro, micro
         out[k, 5], out[k, 6], out[k, 7] = law.sliding_variable_m_per_s, law.bound_n, s.macro_current_a
@@ -206,8 +225,12 @@ def run(
     decoupler: np.ndarray | None = None,
     relative: Reference | None = None,
     state: np.ndarray | None = None,
+    noise_m: np.ndarray | None = None,
 ) -> Run:
-    """Follow a reference; the stage begins on it (`state` else). `law` and `loop` are left as the last row has them."""
+    """Follow a reference; the stage begins on it (`state` else). `law` and `loop` are left as the last row has them.
+
+    `noise_m`, shape (n, 2): what the sensors of macro and end add to each sample.
+    """
     if state is None:
         state = plant_as_printed.init(float(reference.position_m[0]), float(reference.velocity_m_per_s[0]))
     law = sliding_mode.init() if law is None else law
@@ -215,5 +238,6 @@ def run(
     at = np.ascontiguousarray(reference.columns())
     beside = np.zeros_like(at) if relative is None else np.ascontiguousarray(relative.columns())
     out = np.zeros((at.shape[0], _COLUMNS_COUNT))
-    done = _run(state, plant, loop, law, decoupler, at, beside, out)
+    noise_m = np.zeros((0, 2)) if noise_m is None else np.ascontiguousarray(noise_m)
+    done = _run(state, plant, loop, law, decoupler, at, beside, noise_m, out)
     return Run(reference, *(out[:done, k] for k in range(_COLUMNS_COUNT)))

@@ -14,15 +14,15 @@ _BANNER = (
 COLUMNS = ("paper", "what", "paper's", "as printed", "corrected", "remark")
 
 
-def page(chapters: Sequence[Chapter], missing: Sequence[str]) -> Report:
-    """Make the page; `missing` says what of the paper is not on it."""
+def page(chapters: Sequence[Chapter], beyond: Sequence[str]) -> Report:
+    """Make the page; `beyond` says where it goes on."""
     parts: list[Table | Figure | Section] = []
     for chapter in chapters:
         parts.append(Table(f"{chapter.section}. {chapter.title}", COLUMNS, [cells(row) for row in chapter.rows]))
         parts.append(Section("Readings", chapter.readings))
         parts += chapter.figures
-    if missing:
-        parts.append(Section("Not here yet", missing))
+    if beyond:
+        parts.append(Section("Beyond the paper", beyond))
     paper = "Kang et al., Machines 11(12):1044, 2023, doi 10.3390/machines11121044"
     return Report(TITLE, _BANNER, parts=parts, facts=[("Paper", paper)])
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stagectl.laws.dsmc import integrand
-from stagectl.paper import cases, plant_as_printed, sliding_mode
+from stagectl.paper import cases, plant_as_printed, ratchet, sliding_mode
 from stagectl.paper.cases import LIMIT_S, Setting
 from stagectl.paper.closed_loop import Run
 from stagectl.paper.figures import CORRECTED, PRINTED, THIRD, Curve, Panel, drawn
@@ -20,6 +20,8 @@ _LYAPUNOV_OFFSET_M = 3e-3
 _START_OFFSETS_M = (5e-3, 80e-3)  # within the gap; so far off that the voltage saturates
 _REST_S = 15.0  # of the trapezoid: the reference stands again
 _LEAK_PER_S = 2.0
+_CLIMB_S = 600.0
+_NOISY_M, _NOISY_S = 100e-9, 60.0
 
 
 def chapter() -> Chapter:
@@ -41,6 +43,7 @@ def chapter() -> Chapter:
         *_bound_rows(),
         *_inertia_rows(),
         *(row for offset in _START_OFFSETS_M for row in _ratchet_rows(offset, started)),
+        *_climb_rows(),
         *_proof_rows(proofs),
     ]
     return Chapter(
@@ -59,6 +62,8 @@ def chapter() -> Chapter:
             "2 e - e |e| / phi.",
             "eta = 1.8e-4 /s leaves the surface undamped. Corrected: eta = 2 sqrt(gamma).",
             "m2 d1'' is dropped from (39): with Newton's (2) it isn't there.",
+            "At rest with noise: the platform of 5.3 stands on its reference; each position has white noise, and "
+            "velocities are differences of samples.",
             "(40) never falls. Corrected: with - sigma (Omega - Omega_0), sigma = "
             f"{_LEAK_PER_S:g} /s, at rest while the voltage saturates.",
             "(44) integrates y over e in the place of time, so (45) bounds nothing. (42) speaks of |s| >= r "
@@ -160,6 +165,25 @@ def _ratchet_rows(offset_m: float, started: dict[tuple[float, str], Run]) -> lis
         remark = f"voltage saturated {saturated[0]:.0f} % and {saturated[1]:.1f} % of the time"
         rows.append(pair("(40)", f"{where}: error while the reference stands at last, peak", "m", None, errors, remark))
     return rows
+
+
+def _climb_rows() -> list[Row]:
+    printed = ratchet.at_rest(_ratcheting(), _CLIMB_S)
+    corrected = ratchet.at_rest(sliding_mode.corrected(leak_per_s=_LEAK_PER_S), _CLIMB_S)
+    noisy = ratchet.at_rest(_ratcheting(), _NOISY_S, _NOISY_M)
+    whole = ratchet.at_rest(sliding_mode.init(), _NOISY_S)
+    held = f"at rest, {1e9 * ratchet.NOISE_M:g} nm of noise"
+    above_n = corrected.last_bound_n - CONTROL_5_3.first_bound_n
+    return [
+        pair("(40)", f"{held}: Omega climbs by, per hour", "N", None, (printed.rate_n_per_h, corrected.rate_n_per_h),
+            f"{_CLIMB_S / 60.0:g} min simulated; 95 %: +- {1e6 * printed.half_width_n_per_h:.2g} uN and +- "
+            f"{1e6 * corrected.half_width_n_per_h:.2g} uN. With sigma it rests {1e6 * above_n:.2g} uN above Omega_0"),
+        Row("(40)", f"{held}: hours until k + (k / r) Omega has doubled", "1", None, printed.doubled_h, "never",
+            "the climb goes with the square of the noise, and hardly with Omega"),
+        Row("(40)", f"the same, {1e9 * _NOISY_M:g} nm", "1", None, noisy.doubled_h, "never"),
+        Row("(40)", f"{held}, the printed surface as well: Omega climbs by, per hour", "N", None, whole.rate_n_per_h,
+            None, "L_w, which (29) leaves out, and y(e) make a limit cycle that feeds it"),
+    ]  # fmt: skip
 
 
 # ---- the theorem --------------------------------------------------------------------------------------------------
