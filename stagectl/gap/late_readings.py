@@ -3,9 +3,9 @@
     y(t) = x(t - T)  of  m x'' = u + f(x, x')  is  m y'' = (1 - T')^2 u(t - T) + f(y, y')
 
 A late body's own laws follow its readings and notice nothing. Motors and what lies between the bodies act on it T
-later; a lag of its sensor passes them through the same lag; a clock of its own is a T that grows. Taken as an error -v T
-of the readings it would bring the noise of v into them (21 nm into readings of 5), and a reversal would seem to tell a
-late sensor from a late motor, which it can't. Bodies meet at one instant: their relative position is of readings moved
+later; a lag of its sensor passes them through the same lag; a clock of its own is a T that grows. Taken as an error
+-v T of the readings it would bring the noise of v into them (21 nm into readings of 5), and a reversal would seem to tell
+a late sensor from a late motor, which it can't. Bodies meet at one instant: their relative position is of readings moved
 there. Pure.
 """
 

@@ -237,7 +237,7 @@ class Judge:
         """Return the candidate that is worth most; of those that can't be told from it, one with the least numbers."""
         now = self.gain(beside)
         gains = {id(group): self.gain([*beside, group]) - now for group in candidates}
-        best = max(candidates, key=lambda group: gains[id(group)] - self.price() * group.complexity)
+        best = max(candidates, key=lambda group: gains[id(group)] - self.price() * _form(group))
         limit = gains[id(best)] - ALIAS_GAIN - ALIAS_SHARE * gains[id(best)]
         near = [group for group in candidates if gains[id(group)] > limit and group.complexity < best.complexity]
         return max(near, key=lambda group: gains[id(group)] - self.price() * group.complexity, default=best)
@@ -269,12 +269,20 @@ class Judge:
         ratio = REPEATING_RATIO if repeats else MATERIAL_RATIO
         least = ratio * (whole - self.gain([]) + self.modelled)
         gained = whole - self.gain(chosen)
-        return apart > -CONTRADICTION and gained > max(
-            self._threshold_of(group), least, self.price() * group.complexity
-        )
+        enough = max(self._threshold_of(group), least, self.price() * group.complexity)
+        return gained > enough and self._foretells(chosen, [group])
+
+    def _foretells(self, chosen: Sequence[Group], more: Sequence[Group]) -> bool:
+        """Tell whether held-out recordings do not speak against what comes on top."""
+        return self.foretold([*chosen, *more]) - self.foretold(chosen) > -CONTRADICTION
 
     def _threshold_of(self, group: Group) -> float:
-        """Return what a hypothesis has to gain to stand out of noise, searched shapes included."""
+        """Return what a hypothesis has to gain to stand out of noise, searched shapes included.
+
+        What a known parameter does is exact, and its stated uncertainty is paid for by its prior.
+        """
+        if group.key[1] == "parameter":
+            return self.threshold
         return NAMING_RATIO * self.threshold + SEARCH_PRICE * group.searched
 
     def _admissible(self, start: Sequence[Group]) -> list[Group]:
