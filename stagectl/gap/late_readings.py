@@ -4,9 +4,9 @@
 
 A late body's own laws follow its readings and notice nothing. Motors and what lies between the bodies act on it T
 later; a lag of its sensor passes them through the same lag; a clock of its own is a T that grows. Taken as an error
--v T of the readings it would bring the noise of v into them (21 nm into readings of 5), and a reversal would seem to tell
-a late sensor from a late motor, which it can't. Bodies meet at one instant: their relative position is of readings moved
-there. Pure.
+-v T of the readings it would bring the noise of v into them (21 nm into readings of 5), and a reversal would seem to
+tell a late sensor from a late motor, which it can't. Bodies meet at one instant: their relative position is of readings
+moved there. Pure.
 """
 
 from collections.abc import Callable, Iterator, Sequence
