@@ -64,6 +64,7 @@ class Competition:
         evidence.finish(np.array([sd for _, sd in self.parameters]), nulls_count, seed)
         self._refiner: tuple[tuple[int, ...], Refiner] | None = None
         self.judge = Judge(evidence, training_count, base, library, self._refined, self._gains_at_size)
+        self.judge.curves = self.curves
         self.judge.modelled = self._modelled()
         self.judge.is_rough = any(level.white_force_n > 0.0 for level in noise.values())
 

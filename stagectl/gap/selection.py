@@ -21,6 +21,12 @@ MATERIAL_RATIO = 0.005
 REPEATING_RATIO = 0.002
 """The same of what repeats over a pitch or a period."""
 
+EXACT_RATIO = 0.0005
+"""The same where with it no curve finds anything any more: what an inexact law leaves, a wrong name explains in part."""
+
+CURVE_GAIN = 3.0
+"""Of what the best of the library gains on noise, what a curve has to gain to be a rest that something has left."""
+
 SEARCH_PRICE = 2.0
 """What a shape that is searched beyond the grid gains on noise, at most about (chi square of one number)."""
 
@@ -71,6 +77,7 @@ class Judge:
     library: list[Group]
     refine: Refine
     gains_at_size: GainsAtSize
+    curves: list[Group] = field(default_factory=list)
     threshold: float = 0.0
     modelled: float = (
         0.0  # what laws of the model explain already that are known to be inexact, in squares of the noise
@@ -269,8 +276,15 @@ class Judge:
         ratio = REPEATING_RATIO if repeats else MATERIAL_RATIO
         least = ratio * (whole - self.gain([]) + self.modelled)
         gained = whole - self.gain(chosen)
+        if EXACT_RATIO / ratio * least < gained <= least and not self.leaves_curve([*chosen, group]):
+            least = 0.0
         enough = max(self._threshold_of(group), least, self.price() * group.complexity)
         return gained > enough and self._foretells(chosen, [group])
+
+    def leaves_curve(self, chosen: Sequence[Group]) -> bool:
+        """Tell whether a table over position, velocity or time still finds something."""
+        now = self.gain(chosen)
+        return any(self.gain([*chosen, curve]) - now > CURVE_GAIN * self.threshold for curve in self.curves)
 
     def _foretells(self, chosen: Sequence[Group], more: Sequence[Group]) -> bool:
         """Tell whether held-out recordings do not speak against what comes on top."""
