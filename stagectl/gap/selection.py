@@ -22,7 +22,7 @@ REPEATING_RATIO = 0.002
 """The same of what repeats over a pitch or a period."""
 
 EXACT_RATIO = 0.0005
-"""The same where with it no curve finds anything any more: what an inexact law leaves, a wrong name explains in part."""
+"""The same where with it no curve finds anything any more: a wrong name explains only a part of what laws leave."""
 
 CURVE_GAIN = 3.0
 """Of what the best of the library gains on noise, what a curve has to gain to be a rest that something has left."""
