@@ -198,8 +198,8 @@ def test_two_that_only_stand_together_are_found():
     def draw(run, random):
         one, other = random.standard_normal(4000), random.standard_normal(4000)
         if run % 2:
-            one = other = np.sqrt(10.0) * one
-        return [random.standard_normal(4000) + 0.3 * one - 0.3 * other, one, other]
+            one = other = np.sqrt(30.0) * one
+        return [random.standard_normal(4000) + 0.5 * one - 0.5 * other, one, other]
 
     pair = [Group((name, "macro_force"), (column,)) for name, column in (("one", 1), ("other", 2))]
     judge = _table_judge(draw, pair, training=4, runs=4)
