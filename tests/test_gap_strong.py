@@ -18,9 +18,7 @@ H, STEPS, MASS, NOISE_M = 1e-3, 10, 40.0, 5e-9
 DURATION_S = 8.0
 PITCH_M, RIPPLE = 15.4e-3, 0.03
 
-AXIS = Believed(
-    "an axis", H, BelievedAxis(MASS, 0.2, NOISE_M, 0.0, force_constant_sd_ratio=0.005, latch_sd_s=5e-6)
-)
+AXIS = Believed("an axis", H, BelievedAxis(MASS, 0.2, NOISE_M, 0.0, force_constant_sd_ratio=0.005, latch_sd_s=5e-6))
 
 
 def _axis_under(made_n: Callable[[float, float, float], float], seed: int) -> Log:
@@ -72,7 +70,7 @@ def test_a_ripple_of_the_force_constant_stands_out_in_step_with_the_motor():
 
 
 def test_a_strong_effect_is_searched_until_nothing_is_left_and_does_not_raise_the_noise():
-    """Of millions of squares a pitch that is 1e-4 off leaves a rest, and a noise read off with the effect in it hides."""
+    """Of millions of squares a pitch that is 1e-4 off leaves a rest, and a noise read off beside it hides."""
     recordings, noise = _recordings(), slow_noise(AXIS, _recordings()[0])
     first = Competition(recordings, 2, nulls_count=20, noise=noise)
     first.judge.calibrate()
