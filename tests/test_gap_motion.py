@@ -100,7 +100,7 @@ def touching():
 
 @pytest.mark.parametrize(
     ("name", "parameters"),
-    [("soft_contact", [25e-6]), ("contact_damping", [400.0]), ("contact_hysteresis", [0.5, 1e-5])],
+    [("soft_contact", [25e-6]), ("contact_damping", [400.0]), ("contact_hysteresis", [0.5, 1e-6])],
 )
 def test_a_contact_never_pulls_whatever_is_added_at_its_size(touching, name, parameters):
     believed_n = known_forces(touching).end_n - (

@@ -252,14 +252,22 @@ def effect_terms(recordings: Sequence[Recording], grids: dict[str, list[dict[str
 
 
 def periodic_terms(
-    recordings: Sequence[Recording], axis: str, pitches_m: list[float], frequencies_hz: list[float]
+    recordings: Sequence[Recording],
+    axis: str,
+    pitches_m: list[float],
+    driven_pitches_m: list[float],
+    frequencies_hz: list[float],
 ) -> Iterator[Term]:
-    """Yield the effects that have a pitch or a frequency, at those that stand out."""
+    """Yield the effects that have a pitch or a frequency, at those that stand out.
+
+    driven_pitches_m: what stands out in step with the motor's force, of which some laws are a share.
+    """
     side = "macro" if axis == "macro" else "micro"
-    found = {"pitch_m": pitches_m, "frequency_hz": frequencies_hz, "": []}
     for effect in CATALOGUE.values():
         if effect.origin and effect.name not in recordings[0].believed.own_effects:
             continue  # of another profile in this process
+        pitches = driven_pitches_m if "motor_force_n" in effect.quantities else pitches_m
+        found = {"pitch_m": pitches, "frequency_hz": frequencies_hz, "": []}
         for place in effect.places:
             if not place.startswith(side) or (place == "micro_force" and Trait.BASE in effect.traits):
                 continue

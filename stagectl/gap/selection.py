@@ -207,6 +207,16 @@ class Judge:
             self._known_rivals[state] = self._ranked(chosen, RIVALS_COUNT)
         return self._known_rivals[state]
 
+    def reshaped(self, chosen: Sequence[Group]) -> list[Group]:
+        """Return groups at the shapes that are best here: what they were along another motion need not be it."""
+        found = list(chosen)
+        for k, group in enumerate(found):
+            rest = [*found[:k], *found[k + 1 :]]
+            (anew,) = self.refine([*self.base, *rest], [group])
+            if self._allowed([*rest, anew]) and self._worth([*rest, anew]) > self._worth(found):
+                found[k] = anew
+        return found
+
     def _ranked(self, chosen: Sequence[Group], most: int) -> list[Group]:
         """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
         beside = [*self.base, *chosen]
