@@ -9,8 +9,10 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap import balance
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.effect_forces import effect_forces, known_forces
+from stagectl.gap.findings import Named
 from stagectl.gap.log import Log
 from stagectl.gap.motion import motion_of, motion_under
+from stagectl.gap.naming import friction_that_drives
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.operating_point import operating_point, with_joint_changed
 from stagectl.gap.settling import settled_by
@@ -120,3 +122,23 @@ def test_what_the_joint_was_settled_by_is_known(touching):
     assert found == pytest.approx({"left_m": 0.2e-6, "right_m": -0.1e-6, "contact_damping on contact": 0.05})
     assert there.believed.effects[0]["damping_n_s_per_m"] == pytest.approx(94.5)
     assert np.max(there.penetration_m) == pytest.approx(np.max(touching.penetration_m) + 0.1e-6, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("slope_n_per_m", "level_n", "drives"), [(4.0, 0.0, True), (4.0, 0.09, False), (-6.0, 0.1, True)]
+)
+def test_a_friction_that_changes_along_the_way_never_drives(slope_n_per_m, level_n, drives):
+    """Over 20 mm to both sides, 4 N/m need a dry friction of 0.08 N."""
+    recording = balance.recording_of(_axis_log(_swing(T_S)), AXIS)
+    along = Named(
+        "position_dependent_friction",
+        "macro_force",
+        {"slope_n_per_m": slope_n_per_m},
+        {"slope_n_per_m": 0.01},
+        9.0,
+        9.0,
+    )
+    dry = Named("coulomb_friction", "macro_force", {"level_n": level_n}, {"level_n": 0.001}, 9.0, 9.0)
+    elsewhere = dataclasses.replace(dry, acts_on="micro_force", parameters={"level_n": 9.0})
+    found = friction_that_drives([along, dry, elsewhere], [recording])
+    assert found == ((along,) if drives else ())

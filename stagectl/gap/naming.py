@@ -1,5 +1,7 @@
 """What was chosen, in words and numbers: effects by name, known parameters by their errors. Pure."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from stagectl.effects import CATALOGUE
@@ -9,6 +11,7 @@ from stagectl.gap.competition import Competition
 from stagectl.gap.findings import Named, ParameterError
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Solution, solve
+from stagectl.gap.recording import Recording
 from stagectl.gap.settling import settled_by
 
 
@@ -142,6 +145,36 @@ def parameter_errors(search: Competition, chosen: list[Group], solution: Solutio
             own = stated[hypotheses.parts_of(term.name)[0]]
             aliases = tuple(key[0] for key, _ in search.judge.aliases(chosen, group) if key[1] == "parameter")
             found.append(ParameterError(term.name, float(values[0]), float(sds[0]), own, aliases))
+    return tuple(found)
+
+
+_ALONG_THE_WAY = "position_dependent_friction"
+_DRY_LEVELS = ("level_n", "forward_n", "backward_n")
+_DRIVING_SDS = 3.0
+
+
+def friction_that_drives(named: Sequence[Named], recordings: Sequence[Recording]) -> tuple[Named, ...]:
+    """Return frictions that change along the way by more than all dry friction there is: where they end, they drive.
+
+    A spring that pulls in one direction of motion only is one half of a spring and one half of such a friction.
+    """
+    found = []
+    for one in named:
+        if one.name != _ALONG_THE_WAY:
+            continue
+        axis = "macro" if one.acts_on.startswith("macro") else "end"
+        rows = [row for row in recordings[0].believed.effects if row["acts_on"] == one.acts_on]
+        beside = [other.parameters | {"name": other.name} for other in named if other.acts_on == one.acts_on]
+        slope = one.parameters["slope_n_per_m"] + sum(row["slope_n_per_m"] for row in rows if row["name"] == one.name)
+        level_n = sum(
+            min(row[name] for name in _DRY_LEVELS if name in row)
+            for row in (*rows, *beside)
+            if any(name in row for name in _DRY_LEVELS)
+        )
+        reach_m = max(float(np.max(np.abs(r.position_m(axis)))) for r in recordings)
+        slack_n = _DRIVING_SDS * one.sds["slope_n_per_m"] * reach_m
+        if not abs(slope) * reach_m - slack_n <= level_n:
+            found.append(one)
     return tuple(found)
 
 
