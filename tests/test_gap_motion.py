@@ -124,21 +124,12 @@ def test_what_the_joint_was_settled_by_is_known(touching):
     assert np.max(there.penetration_m) == pytest.approx(np.max(touching.penetration_m) + 0.1e-6, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("slope_n_per_m", "level_n", "drives"), [(4.0, 0.0, True), (4.0, 0.09, False), (-6.0, 0.1, True)]
-)
+@pytest.mark.parametrize(("slope_n_per_m", "level_n", "drives"), [(4.0, 0.0, 1), (4.0, 0.09, 0), (-6.0, 0.1, 1)])
 def test_a_friction_that_changes_along_the_way_never_drives(slope_n_per_m, level_n, drives):
     """Over 20 mm to both sides, 4 N/m need a dry friction of 0.08 N."""
     recording = balance.recording_of(_axis_log(_swing(T_S)), AXIS)
-    along = Named(
-        "position_dependent_friction",
-        "macro_force",
-        {"slope_n_per_m": slope_n_per_m},
-        {"slope_n_per_m": 0.01},
-        9.0,
-        9.0,
-    )
-    dry = Named("coulomb_friction", "macro_force", {"level_n": level_n}, {"level_n": 0.001}, 9.0, 9.0)
+    name, size = "position_dependent_friction", "slope_n_per_m"
+    along = Named(name, "macro_force", {size: slope_n_per_m}, {size: 0.01}, 9.0, 9.0, ())
+    dry = Named("coulomb_friction", "macro_force", {"level_n": level_n}, {"level_n": 0.001}, 9.0, 9.0, ())
     elsewhere = dataclasses.replace(dry, acts_on="micro_force", parameters={"level_n": 9.0})
-    found = friction_that_drives([along, dry, elsewhere], [recording])
-    assert found == ((along,) if drives else ())
+    assert friction_that_drives([along, dry, elsewhere], [recording]) == (along,) * drives
