@@ -164,10 +164,10 @@ def friction_that_drives(named: Sequence[Named], recordings: Sequence[Recording]
             continue
         axis = "macro" if one.acts_on.startswith("macro") else "end"
         rows = [row for row in recordings[0].believed.effects if row["acts_on"] == one.acts_on]
-        beside = [other.parameters | {"name": other.name} for other in named if other.acts_on == one.acts_on]
+        beside = [other.parameters for other in named if other.acts_on == one.acts_on]
         slope = one.parameters["slope_n_per_m"] + sum(row["slope_n_per_m"] for row in rows if row["name"] == one.name)
         level_n = sum(
-            min(row[name] for name in _DRY_LEVELS if name in row)
+            min(float(row[name]) for name in _DRY_LEVELS if name in row)
             for row in (*rows, *beside)
             if any(name in row for name in _DRY_LEVELS)
         )
