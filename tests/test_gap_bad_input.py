@@ -303,5 +303,5 @@ def test_a_micro_that_pushes_the_macro_back_is_a_missing_effect_and_no_other_mac
     plausibility.check_recordings(unsaid, [recording_of(log, unsaid)])
     heavier = dataclasses.replace(log, macro_command_n=2.0 * log.macro_command_n)
     for one in (believed, unsaid):
-        with pytest.raises(RequestError, match="profile of another machine|is this machine.s profile"):
+        with pytest.raises(RequestError, match=r"profile of another machine|is this machine.s profile"):
             plausibility.check_recordings(one, [recording_of(heavier, one)])
