@@ -214,7 +214,8 @@ def _periodic(recordings: list[Recording], blocks: list[_Rows]) -> list[Term]:
         used = columns[:, size > 0.0] / size[size > 0.0]
         rest = left - used @ np.linalg.lstsq(used, left, rcond=1e-8)[0]
         place_m = np.concatenate([_sampled_place(recording, axis) for recording in recordings])
-        terms += hypotheses.periodic_terms(recordings, axis, _pitches_m(place_m, rest), [])
+        pitches = _pitches_m(place_m, rest)
+        terms += hypotheses.periodic_terms(recordings, axis, pitches, pitches, [])
     return terms
 
 

@@ -101,7 +101,12 @@ WORKED: dict[str, list[Case]] = {
     ],
     # in all 1e4 x 25e-12 / 20e-6 = 12.5 mN where the linear law has 50 mN; beyond the knee always K delta / 2 less
     "soft_contact": [Case((5e-6, 1e4, 10e-6), -0.0375), Case((30e-6, 1e4, 10e-6), -0.05)],
-    "contact_hysteresis": [Case((1e-5, 0.01, 1e4, 0.1, 1e-4), 0.01), Case((1e-5, -0.01, 1e4, 0.1, 1e-4), -0.01)],
+    # pressed on; let go by as much as it turns over: 1 / e of it on average; touched anew
+    "contact_hysteresis": [
+        Case((1e-5, 0.01, 1e4, 1e-3, 0.1, 1e-5), 0.01, (0.0,), (0.0,)),
+        Case((1e-5, -0.01, 1e4, 1e-3, 0.1, 1e-5), 0.01 / math.e, (0.0,), (2.0 - 2.0 / math.e,)),
+        Case((0.0, 0.0, 1e4, 1e-3, 0.1, 1e-5), 0.0, (1.5,), (0.0,)),
+    ],
     "backlash_width_change": [Case((1.0, 4e-6), 2e-6), Case((-1.0, 4e-6), 2e-6)],
     "backlash_centre_shift": [Case((1.0, 3e-6), 3e-6), Case((-1.0, 3e-6), -3e-6)],
     "backlash_wear": [Case((100.0, 2e-8), 1e-6), Case((0.0, 2e-8), 0.0)],
@@ -189,7 +194,7 @@ PARAMETERS: dict[str, tuple[float, ...]] = {  # some plausible values, in the or
     "contact_damping": (75.0,),
     "contact_stiffness_error": (0.1, -0.05),
     "soft_contact": (10e-6,),
-    "contact_hysteresis": (0.1, 1e-4),
+    "contact_hysteresis": (0.1, 5e-6),
     "backlash_width_change": (10e-6,),
     "backlash_centre_shift": (-5e-6,),
     "backlash_wear": (1e-7,),

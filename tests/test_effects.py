@@ -184,10 +184,11 @@ def test_a_memory_is_bounded_for_any_step(moves, name):
     for value, dt_s in moves:
         given_values = {"velocity_m_per_s": value, "acceleration_m_per_s2": value, "command_a": value, "mass_kg": 1.0}
         given_values |= {"dt_s": dt_s, "t_s": t_s}
+        given_values |= {"penetration_m": 1e-5, "penetration_velocity_m_per_s": value, "contact_stiffness_n_per_m": 1e4}
         known.compiled_law(*[given_values[key] for key in known.quantities], *PARAMETERS[name], memory)
         t_s += dt_s
     largest = {"dahl_friction": 1.0, "cable_hysteresis": 1.0, "lugre_friction": 1.4, "current_loop_lag": 2.0}
-    largest |= {"flexible_mode": 10.0, "sensor_lag": 0.01, "command_delay": 1e3}
+    largest |= {"flexible_mode": 10.0, "sensor_lag": 0.01, "command_delay": 1e3, "contact_hysteresis": 2.0}
     assert np.all(np.abs(memory) <= largest[name] * (1.0 + 1e-12))
 
 
@@ -313,8 +314,8 @@ def test_what_a_search_can_not_know_of_a_law(declared, said):
 def test_what_laws_say_by_their_arguments():
     """Steps and periods are in the text of a law: nobody lists their names."""
     steps = {name for name, known in CATALOGUE.items() if known.has_step}
-    assert {"coulomb_friction", "stribeck_friction", "contact_hysteresis"} <= steps
-    assert not steps & {"viscous_friction", "dahl_friction", "cogging"}
+    assert {"coulomb_friction", "stribeck_friction", "load_dependent_friction"} <= steps
+    assert not steps & {"viscous_friction", "dahl_friction", "cogging", "contact_hysteresis"}
     periods = {name: known.period for name, known in CATALOGUE.items() if known.period}
     assert periods == {
         "cogging": "pitch_m",

@@ -1,5 +1,6 @@
 """Recordings that `stagectl gap` must not learn from: an error that says what to look at, or a stated exclusion."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -7,8 +8,9 @@ import pytest
 
 from stagectl import cli
 from stagectl.backend import BatchBackend
-from stagectl.errors import RecordError
+from stagectl.errors import RecordError, RequestError
 from stagectl.gap import plausibility
+from stagectl.gap.balance import recording_of
 from stagectl.gap.believed import load_believed
 from stagectl.gap.log import read_log
 from stagectl.record import read_run
@@ -289,3 +291,17 @@ def test_reported_forces_become_currents(homed_run):
 def test_a_run_at_another_rate_is_of_another_machine(homed_run):
     with pytest.raises(RecordError, match="recorded at 1000 Hz, the profile says 2000 Hz"):
         read_log(homed_run, 0.5e-3)
+
+
+def test_a_micro_that_pushes_the_macro_back_is_a_missing_effect_and_no_other_machine(stage_tables, tmp_path):
+    """The macro seems to weigh as much as both where the micro's drive stands on it and nobody says so."""
+    believed = load_believed("oled-printer")
+    log = read_log(brought_in(stage_tables[0], "run", tmp_path, STAGE_MAP), believed.period_s, believed)
+    silent = tuple(row for row in believed.effects if row["name"] != "micro_reaction")
+    assert len(silent) < len(believed.effects)
+    unsaid = dataclasses.replace(believed, effects=silent)
+    plausibility.check_recordings(unsaid, [recording_of(log, unsaid)])
+    heavier = dataclasses.replace(log, macro_command_n=2.0 * log.macro_command_n)
+    for one in (believed, unsaid):
+        with pytest.raises(RequestError, match=r"profile of another machine|is this machine.s profile"):
+            plausibility.check_recordings(one, [recording_of(heavier, one)])

@@ -9,10 +9,12 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap import balance
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.effect_forces import effect_forces, known_forces
+from stagectl.gap.findings import Named
 from stagectl.gap.log import Log
 from stagectl.gap.motion import motion_of, motion_under
+from stagectl.gap.naming import friction_that_drives
+from stagectl.gap.noise import slow_noise
 from stagectl.gap.operating_point import operating_point, with_joint_changed
-from stagectl.gap.reading_errors import reading_error_m
 from stagectl.gap.settling import settled_by
 
 H, MASS_KG, NOISE_M = 1e-3, 40.0, 5e-9
@@ -50,21 +52,34 @@ def test_what_a_law_runs_along_holds_nothing_of_later_samples():
     assert not np.array_equal(first.at_samples[cut + 2 :, :2], second.at_samples[cut + 2 :, :2])
 
 
-@pytest.mark.parametrize("start_s", [0.0, 140.0])
-def test_readings_of_a_skewed_clock_are_put_where_they_were_taken(start_s):
-    """27 ppm are 3.9 ms after 144 s: at 1.3 Hz two terms of a series miss by 0.11 um, and 0.6 mm are moved."""
-    late_s = 27e-6 * (start_s + T_S)
-    random = np.random.default_rng(5)
-    recording = balance.recording_of(
-        _axis_log(_swing(T_S + late_s) + NOISE_M * random.standard_normal(COUNT), start_s), AXIS
+LATE = {
+    "sensor_delay": {"delay_s": 3e-3},
+    "sensor_lag": {"time_constant_s": 3e-3},
+    "clock_skew": {"skew_ppm": 27.0},  # 3.9 ms after 144 s, where two terms of a series miss by 0.11 um
+}
+
+
+@pytest.mark.parametrize("name", LATE)
+def test_a_late_body_is_balanced_by_forces_that_come_as_late(name):
+    """Read through the sensor, the swing leaves its noise alone under what the late body feels, and more without."""
+    random, start_s = np.random.default_rng(5), 140.0
+    if name == "sensor_lag":
+        lag = 1.0 / (1.0 + 1j * W * 3e-3)
+        read_m = 0.02 * abs(lag) * np.sin(W * T_S + np.angle(lag))
+    else:
+        late_s = np.full(COUNT, 3e-3) if name == "sensor_delay" else -27e-6 * (start_s + T_S)
+        read_m = _swing(T_S - late_s)
+    recording = balance.recording_of(_axis_log(read_m + NOISE_M * random.standard_normal(COUNT), start_s), AXIS)
+    known = operating_point(recording, [(CATALOGUE[name], "macro_sensor", LATE[name])])
+    assert known.log.macro_position_m is recording.log.macro_position_m
+    for one, low, high in ((known, 0.9, 1.1), (recording, 1.2, np.inf)):
+        balance.set_noise(one, slow_noise(AXIS, one))
+        assert low < np.std(balance.observed(one)[0]) < high
+    alone = effect_forces(recording, CATALOGUE[name], "macro_sensor", list(LATE[name].values()))
+    balance.set_noise(recording, slow_noise(AXIS, recording))
+    assert np.std(balance.unexplained(recording, alone)[0]) == pytest.approx(
+        float(np.std(balance.observed(known)[0])), abs=0.01
     )
-    skew = CATALOGUE["clock_skew"]
-    there = operating_point(recording, [(skew, "macro_sensor", {"skew_ppm": 27.0})])
-    off_m = there.log.macro_position_m - _swing(T_S)
-    assert np.std(off_m[400:-20]) < 1.2 * NOISE_M
-    error_m = reading_error_m(recording, skew, "macro_sensor", [27.0], whole=True)[:, 0]
-    moved_m = _swing(T_S + late_s) - _swing(T_S)
-    assert np.max(np.abs(error_m - moved_m)[400:-20]) < 1e-4 * np.max(np.abs(moved_m)) + NOISE_M
 
 
 JOINT = BelievedJoint(
@@ -87,7 +102,7 @@ def touching():
 
 @pytest.mark.parametrize(
     ("name", "parameters"),
-    [("soft_contact", [25e-6]), ("contact_damping", [400.0]), ("contact_hysteresis", [0.5, 1e-5])],
+    [("soft_contact", [25e-6]), ("contact_damping", [400.0]), ("contact_hysteresis", [0.5, 1e-6])],
 )
 def test_a_contact_never_pulls_whatever_is_added_at_its_size(touching, name, parameters):
     believed_n = known_forces(touching).end_n - (
@@ -107,3 +122,14 @@ def test_what_the_joint_was_settled_by_is_known(touching):
     assert found == pytest.approx({"left_m": 0.2e-6, "right_m": -0.1e-6, "contact_damping on contact": 0.05})
     assert there.believed.effects[0]["damping_n_s_per_m"] == pytest.approx(94.5)
     assert np.max(there.penetration_m) == pytest.approx(np.max(touching.penetration_m) + 0.1e-6, rel=1e-3)
+
+
+@pytest.mark.parametrize(("slope_n_per_m", "level_n", "drives"), [(4.0, 0.0, 1), (4.0, 0.09, 0), (-6.0, 0.1, 1)])
+def test_a_friction_that_changes_along_the_way_never_drives(slope_n_per_m, level_n, drives):
+    """Over 20 mm to both sides, 4 N/m need a dry friction of 0.08 N."""
+    recording = balance.recording_of(_axis_log(_swing(T_S)), AXIS)
+    name, size = "position_dependent_friction", "slope_n_per_m"
+    along = Named(name, "macro_force", {size: slope_n_per_m}, {size: 0.01}, 9.0, 9.0, ())
+    dry = Named("coulomb_friction", "macro_force", {"level_n": level_n}, {"level_n": 0.001}, 9.0, 9.0, ())
+    elsewhere = dataclasses.replace(dry, acts_on="micro_force", parameters={"level_n": 9.0})
+    assert friction_that_drives([along, dry, elsewhere], [recording]) == (along,) * drives

@@ -150,6 +150,75 @@ def test_a_belief_that_fitting_made_worse_is_what_the_gap_is_counted_from():
     assert judge.reducible_before()[1] == pytest.approx(1000.0, rel=0.25)
 
 
+def _table_judge(draw, library, *, base=(), training=2, curves=(), runs=3):
+    """A judge of runs that `draw(run, random)` makes, [innovations, columns...] each; a threshold of 20 squares."""
+    random = np.random.default_rng(8)
+    sums = []
+    for run in range(runs):
+        block = np.column_stack(draw(run, random))
+        sums.append(Sums(block.T @ block, float(len(block)), str(run), str(run), np.zeros((1, 1))))
+    judge = Judge(
+        _Table(sums), training, list(base), list(library), lambda _, groups: list(groups),
+        lambda _, groups: [0.0] * len(groups), curves=list(curves), threshold=20.0,
+    )  # fmt: skip
+    return judge
+
+
+def test_what_is_known_keeps_names_apart_that_motion_does_not():
+    """A mass that is wrong, or everything else wrong by as much: the same column, at ten stated deviations."""
+
+    def draw(run, random):
+        wrong = random.standard_normal(1000)
+        return [random.standard_normal(1000) + wrong, wrong, wrong + 1e-3 * random.standard_normal(1000)]
+
+    base, mass = Group(("force_constant", "parameter"), (1,), prior_sds=(0.1,)), Group(("mass", "parameter"), (2,))
+    judge = _table_judge(draw, [mass], base=[base])
+    assert judge.distance([mass], []) == pytest.approx(100.0, rel=0.1)
+
+
+def test_what_training_leaves_open_does_not_speak_against_the_truth():
+    """Two wrong parameters that training shows the sum of: their values are the prior's, and held-out runs differ."""
+
+    def draw(run, random):
+        shared, own = random.standard_normal(2000), random.standard_normal(2000)
+        second = shared if run < 2 else own
+        return [random.standard_normal(2000) + 0.8 * shared + 0.2 * second, shared, second]
+
+    one, other = (
+        Group((name, "parameter"), (column,), prior_sds=(1.0,)) for name, column in (("one", 1), ("other", 2))
+    )
+    judge = _table_judge(draw, [one, other])
+    assert judge.foretold([one, other]) > judge.foretold([one]) + 50.0
+    assert {group.key[0] for group in judge.select()} == {"one", "other"}
+
+
+def test_two_that_only_stand_together_are_found():
+    """What one recording shows the sum of and another both of: each alone is a compromise that both speak against."""
+
+    def draw(run, random):
+        one, other = random.standard_normal(4000), random.standard_normal(4000)
+        if run % 2:
+            one = other = np.sqrt(30.0) * one
+        return [random.standard_normal(4000) + 0.5 * one - 0.5 * other, one, other]
+
+    pair = [Group((name, "macro_force"), (column,)) for name, column in (("one", 1), ("other", 2))]
+    judge = _table_judge(draw, pair, training=4, runs=4)
+    assert not any(judge._stays([], group) for group in pair)
+    assert {group.key[0] for group in judge.select()} == {"one", "other"}
+
+
+@pytest.mark.parametrize(("is_left", "count"), [(False, 2), (True, 1)])
+def test_a_small_name_beside_a_large_one_stays_where_no_curve_finds_anything(is_left, count):
+    def draw(run, random):
+        large, small, rest = (random.standard_normal(4000) for _ in range(3))
+        hidden = 5.0 * large + 0.15 * small + (0.15 * rest if is_left else 0.0)
+        return [random.standard_normal(4000) + hidden, large, small, rest]
+
+    large, small = Group(("large", "macro_force"), (1,)), Group(("small", "macro_force"), (2,))
+    judge = _table_judge(draw, [large, small], curves=[Group(("curve", "macro_force"), (3,))])
+    assert len(judge.select()) == count
+
+
 def test_on_noise_nothing_is_named():
     assert _judge(0.0).select() == []
 

@@ -56,19 +56,31 @@ def soft_contact(penetration_m, contact_stiffness_n_per_m, knee_m):
 
 @effect(
     places=("contact",),
+    memory=1,
     loss_ratio=(0.0, 0.9),
-    smoothing_m_per_s=(1e-7, 1e-1),
+    turn_m=(1e-8, 1e-3),
     linear=("loss_ratio",),
+    searched=("turn_m",),
     shown_by="contact",
     symptom="contact force larger when pressing than when letting go, whatever the speed",
-    reference="Kang et al. 2023, section 6.1: a loop in the measured contact; Kimball, Lovell, Phys. Rev. 30, 1927",
+    reference="Kang et al. 2023, section 6.1: a loop in the measured contact; Dahl, Aerospace Corp. TOR-0158, 1968",
 )
 def contact_hysteresis(
-    penetration_m, penetration_velocity_m_per_s, contact_stiffness_n_per_m, loss_ratio, smoothing_m_per_s
+    penetration_m, penetration_velocity_m_per_s, contact_stiffness_n_per_m, dt_s, loss_ratio, turn_m, memory
 ):
-    """Loss of the contact's material, the same at any speed: F = h K p tanh((dp/dt) / v_s)."""
-    direction = np.tanh(penetration_velocity_m_per_s / smoothing_m_per_s)
-    return loss_ratio * contact_stiffness_n_per_m * penetration_m * direction
+    """Loss of the contact's material, the same at any speed: F = h K p z, dz/dt = (dp/dt - |dp/dt| z) / delta.
+
+    z is 1 while it is pressed and -1 while it lets go, and turns over a way, `turn_m`, and not over a speed: asperities
+    give way before they slip. What touches anew is pressed. memory: 1 - z. Its step is exact for constant dp/dt.
+    """
+    if penetration_m <= 0.0:
+        if dt_s > 0.0:
+            memory[0] = 0.0
+        return 0.0
+    before = memory[0]
+    goal = 0.0 if penetration_velocity_m_per_s >= 0.0 else 2.0
+    memory[0] = goal + (before - goal) * np.exp(-abs(penetration_velocity_m_per_s) * dt_s / turn_m)
+    return loss_ratio * contact_stiffness_n_per_m * penetration_m * (1.0 - 0.5 * (before + memory[0]))
 
 
 @effect(

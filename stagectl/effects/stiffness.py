@@ -73,7 +73,7 @@ def cable_hysteresis(velocity_m_per_s, dt_s, level_n, slip_m, exponent_ratio, me
     z = memory[0]
     side = 1.0 if velocity_m_per_s >= 0.0 else -1.0
     power = 1.0 - exponent_ratio
-    left = np.power(1.0 - side * z, power) - power * abs(velocity_m_per_s) * dt_s / slip_m
+    left = np.power(max(1.0 - side * z, 0.0), power) - power * abs(velocity_m_per_s) * dt_s / slip_m
     memory[0] = side * (1.0 - np.power(max(left, 0.0), 1.0 / power))
     return -0.5 * level_n * (z + memory[0])
 

@@ -4,8 +4,6 @@ Forces of spring, damping and contact are taken on the measured relative positio
 bodies fall apart into one mass each: `stagectl.gap.innovations` whitens them one by one. Pure.
 """
 
-from typing import Any
-
 import numpy as np
 
 from stagectl.gap import innovations
@@ -13,6 +11,7 @@ from stagectl.gap.believed import Believed
 from stagectl.gap.effect_forces import known_forces
 from stagectl.gap.forces import Forces
 from stagectl.gap.innovations import Noise
+from stagectl.gap.late_readings import Row
 from stagectl.gap.log import Log
 from stagectl.gap.motion import Motion, motion_of, motion_under
 from stagectl.gap.recording import AXES, Recording, put_together
@@ -26,13 +25,15 @@ _ENDING_S = 0.01  # where a late sensor would still have read is not recorded
 _LOOSE_N = 1e3
 
 
-def recording_of(log: Log, believed: Believed, on_command: tuple[dict[str, Any], ...] = ()) -> Recording:
+def recording_of(
+    log: Log, believed: Believed, on_command: tuple[Row, ...] = (), late: tuple[Row, ...] = ()
+) -> Recording:
     """Prepare a log: motion, commands on parts of intervals, contact geometry.
 
-    on_command: effects of the command path that act beside what is believed, as rows of a profile.
+    on_command, late: effects of the command path, and of readings that are late, that act beside what is believed.
     """
     macro = motion_of(log.macro_position_m, log.period_s, believed.macro.noise_m)
-    rough = put_together(log, believed, macro, None, on_command)
+    rough = put_together(log, believed, macro, None, on_command, late)
     return foretold_under(rough, known_forces(rough))
 
 
@@ -46,7 +47,7 @@ def foretold_under(recording: Recording, forces: Forces) -> Recording:
                 recording.motion(axis), recording.position_m(axis), log.valid, force_n, recording.mass_kg(axis),
                 log.period_s, recording.belief(axis).noise_m,
             )  # fmt: skip
-    return put_together(log, believed, motions[0] or recording.macro, motions[1], recording.on_command)
+    return put_together(log, believed, motions[0] or recording.macro, motions[1], recording.on_command, recording.late)
 
 
 def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = True) -> None:

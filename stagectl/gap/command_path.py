@@ -89,7 +89,7 @@ def changed_by(
     if doubled.size == response.size and np.allclose(doubled, 2.0 * response, rtol=_SAME_RATIO, atol=_SAME_RATIO):
         return _stepped(response, command, latch_s, lag_s, period_s)
     fine = _run(effect, parameters, delayed(command, latch_s / period_s), period_s)
-    return _lagged(fine, lag_s, period_s)
+    return lagged(fine, lag_s, period_s)
 
 
 def _run(effect: Effect, parameters: list[float], command: np.ndarray, period_s: float) -> np.ndarray:
@@ -141,8 +141,8 @@ def _stepped(
     return means, np.convolve(steps, at_samples)[: command.size]
 
 
-def _lagged(fine: np.ndarray, lag_s: float, period_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pass held values on parts through the current loop: means over parts (n, parts), values at samples (n,)."""
+def lagged(fine: np.ndarray, lag_s: float, period_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pass held values on parts through a first-order lag: means over parts (n, parts), values at samples (n,)."""
     dt_s = period_s / fine.shape[1]
     flat = fine.ravel()
     decay = float(np.exp(-dt_s / lag_s)) if lag_s > 0.0 else 0.0

@@ -50,6 +50,8 @@ class Competition:
         library: list[Group] = []
         base = self._taken([term for term, _ in self.parameters], [(sd,) for _, sd in self.parameters])
         base += self._taken([hypotheses.deviation_term(*one) for one in moved], [(DEVIATION_SD,)] * len(moved))
+        self.kept += self._taken(kept)
+        known_sds = np.array(self._sds)
         taken = {(effect.name, place) for effect, place, _ in moved}
         grids = grids_for(recordings)
         wrong = hypotheses.wrong_parameter_terms(recordings[0])
@@ -58,12 +60,12 @@ class Competition:
             return self._taken([term for term in terms if term.name not in without and term.key not in taken])
 
         library += searched([*wrong, *hypotheses.effect_terms(recordings, grids)])
-        self.kept += self._taken(kept)
         self.curves += self._taken(list(hypotheses.curve_terms(recordings)))
         library += searched(_periodic_terms(evidence, np.array(self._sds)))
-        evidence.finish(np.array([sd for _, sd in self.parameters]), nulls_count, seed)
+        evidence.finish(known_sds, nulls_count, seed)
         self._refiner: tuple[tuple[int, ...], Refiner] | None = None
         self.judge = Judge(evidence, training_count, base, library, self._refined, self._gains_at_size)
+        self.judge.curves = self.curves
         self.judge.modelled = self._modelled()
         self.judge.is_rough = any(level.white_force_n > 0.0 for level in noise.values())
 
@@ -169,8 +171,9 @@ def _periodic_terms(evidence: Evidence, prior_sds: np.ndarray) -> list[Term]:
     for place, axis in enumerate(recordings[0].axes):
         signals = [seeds.force_signal(r, axis, evidence.rest(k, place, prior_sds)) for k, r in enumerate(recordings)]
         pitches = seeds.pitches_m(recordings, axis, signals)
+        driven = seeds.pitches_m(recordings, axis, seeds.in_step_with_motor(recordings, axis, signals))
         frequencies = seeds.frequencies_hz(recordings, axis, signals)
-        found += hypotheses.periodic_terms(recordings, axis, pitches, frequencies)
+        found += hypotheses.periodic_terms(recordings, axis, pitches, driven, frequencies)
     return found
 
 

@@ -3,27 +3,61 @@
 import numpy as np
 
 from stagectl.effects import CATALOGUE, Effect
+from stagectl.gap import late_readings
 from stagectl.gap.command_path import changed_by
 from stagectl.gap.contact import contact_damping_n_s_per_m
-from stagectl.gap.forces import Forces, add_forces
+from stagectl.gap.forces import Forces, add_forces, scaled_forces
+from stagectl.gap.late_readings import makes_late
 from stagectl.gap.quantities import along_motion, quantities
 from stagectl.gap.reading_errors import misread, more_contact_n, reading_error_m
-from stagectl.gap.recording import Recording, contact_of, relative_motion
+from stagectl.gap.recording import Recording, contact_of, put_together, relative_motion
 
 
 def known_forces(recording: Recording) -> Forces:
     """Sum what is believed to act: motors, joint, effects of the profile."""
-    macro_n = recording.macro_command_n.copy()
-    end_n = None if recording.micro_command_n is None else recording.micro_command_n.copy()
-    joint = recording.believed.joint
-    if end_n is not None and joint is not None:
-        joint_n = joint_force_n(recording)
-        macro_n -= joint_n
-        end_n += joint_n
-    total = Forces(macro_n, end_n)
+    total = Forces(recording.felt_n["macro"].copy(), recording.felt_n["end"].copy() if recording.end else None)
+    if total.end_n is not None and recording.believed.joint is not None:
+        add_forces(total, between(recording, joint_force_n(recording)))
     for row in (*recording.believed.effects, *recording.on_command):
         effect = CATALOGUE[row["name"]]
         add_forces(total, effect_forces(recording, effect, row["acts_on"], [row[name] for name in effect.parameters]))
+    return total
+
+
+def between(recording: Recording, force_n: np.ndarray) -> Forces:
+    """Put a force between the bodies, as it acts on the end, on both, each on the clock of its readings."""
+    felt_n = {axis: late_readings.felt_n(recording.late, axis, recording.log, force_n) for axis in recording.axes}
+    return Forces(macro_n=-felt_n["macro"], end_n=felt_n["end"])
+
+
+def _later(recording: Recording, effect: Effect, place: str, parameters: list[float]) -> Forces:
+    """Return what readings of earlier instants change: motors, the joint, and a micro that pushes the macro back.
+
+    What is known of the same sensor is left out of both: at the size that it has an effect is nothing more.
+    """
+    row = {"name": effect.name, "acts_on": place, **dict(zip(effect.parameters, parameters, strict=True))}
+    others = tuple(one for one in recording.late if (one["name"], one["acts_on"]) != (effect.name, place))
+    total = Forces()
+    for sign, late in ((1.0, (*others, row)), (-1.0, others)):
+        there = put_together(
+            recording.log, recording.believed, recording.macro, recording.end, recording.on_command, late
+        )
+        add_forces(total, scaled_forces(_exchanged(there), sign, Forces()))
+    return total
+
+
+def _exchanged(recording: Recording) -> Forces:
+    """Sum what bodies feel of motors and of each other."""
+    total = Forces(recording.felt_n["macro"], recording.felt_n.get("end"))
+    if recording.end is None:
+        return total
+    if recording.believed.joint is not None:
+        add_forces(total, between(recording, joint_force_n(recording)))
+    for row in recording.believed.effects:
+        effect = CATALOGUE[row["name"]]
+        if row["acts_on"] in ("contact", "joint") or "micro_motor_force_n" in effect.quantities:
+            values = [row[name] for name in effect.parameters]
+            add_forces(total, effect_forces(recording, effect, row["acts_on"], values))
     return total
 
 
@@ -32,7 +66,7 @@ def joint_force_n(recording: Recording) -> np.ndarray:
     joint, end = recording.believed.joint, recording.end
     if joint is None or end is None:
         raise KeyError("joint")
-    x_b, x_b_rate = relative_motion(recording.macro, end)
+    x_b, x_b_rate = relative_motion(recording)
     contact_n = contact_of(recording).push_n(joint, 0.0)
     return contact_n + joint.spring_n_per_m * x_b + joint.damping_n_s_per_m * x_b_rate
 
@@ -47,6 +81,8 @@ def effect_forces(
     """
     axis = "macro" if place.startswith("macro") else "end"
     known = quantities(recording, axis, place)
+    if makes_late(effect):
+        return _later(recording, effect, place, parameters)
     if place.endswith("_sensor"):
         return misread(recording, axis, reading_error_m(recording, effect, place, parameters, whole), whole)
     if place.endswith("_command"):
@@ -55,11 +91,13 @@ def effect_forces(
     if place == "contact":
         value = _contact_changed(recording, value, whole)
     if place in ("contact", "joint"):
-        return Forces(macro_n=-value, end_n=value)
+        return between(recording, value)
     if place == "contact_edge":
         return _edges_moved(recording, effect, parameters, value, whole)
     if place.endswith("_actuator"):
         return motor_forces(recording, axis, value, None)
+    if axis == "macro" and "micro_motor_force_n" in effect.quantities:
+        value = late_readings.felt_n(recording.late, axis, recording.log, value)
     return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
 
 
@@ -109,11 +147,9 @@ def _edges_moved(
         return Forces()
     if not whole:
         stiffness = quantities(recording, "end", "contact_edge")["contact_stiffness_n_per_m"]
-        push_n = -recording.side * value * stiffness
-        return Forces(macro_n=-push_n, end_n=push_n)
+        return between(recording, -recording.side * value * stiffness)
     out_m = {}
     for side in (-1.0, 1.0):
         known = quantities(recording, "end", "contact_edge") | {"contact_side_ratio": np.full_like(value, side)}
         out_m[side] = along_motion(effect, [known[name] for name in effect.quantities], parameters)
-    push_n = more_contact_n(recording, joint, 0.0, 0.0, out_m[-1.0], out_m[1.0])
-    return Forces(macro_n=-push_n, end_n=push_n)
+    return between(recording, more_contact_n(recording, joint, 0.0, 0.0, out_m[-1.0], out_m[1.0]))

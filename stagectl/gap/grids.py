@@ -49,7 +49,7 @@ def grids_for(recordings: Sequence[Recording]) -> Grid:
         ],
         "cable_spring": [{"anchor_m": centre_m}],
         "contact_damping": [{"damping_n_s_per_m": d} for d in (30.0, 150.0, 600.0)],
-        "contact_hysteresis": smooth[::2],
+        "contact_hysteresis": [{"turn_m": t} for t in (1e-6, 5e-6, 2e-5)],
         "soft_contact": [{"knee_m": k} for k in (3e-6, 1e-5, 3e-5, 6e-5)],
         "force_constant_saturation": [{"saturation_n": s} for s in (150.0, 400.0, 1000.0, 3000.0)],
         "amplifier_dead_band": [{"half_width_a": w} for w in (1e-3, 3e-3, 1e-2, 3e-2)],

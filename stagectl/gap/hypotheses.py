@@ -11,11 +11,12 @@ from functools import partial
 import numpy as np
 
 from stagectl.effects import CATALOGUE, Effect, Trait
+from stagectl.gap import late_readings
 from stagectl.gap.command_path import changed_by, driven
-from stagectl.gap.effect_forces import effect_forces, known_forces, motor_forces
+from stagectl.gap.effect_forces import between, effect_forces, known_forces, motor_forces
 from stagectl.gap.forces import Forces, add_forces, scaled_forces
 from stagectl.gap.quantities import quantities
-from stagectl.gap.recording import Recording
+from stagectl.gap.recording import Recording, relative_motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,28 +99,28 @@ def _inertia(axis: str, r: Recording) -> list[Forces]:
 
 
 def _macro_motor(r: Recording) -> list[Forces]:
-    return [Forces(macro_n=r.macro_command_n)]
+    return [Forces(macro_n=r.felt_n["macro"])]
 
 
 def _micro_motor(r: Recording) -> list[Forces]:
-    return [Forces() if r.micro_command_n is None else motor_forces(r, "end", r.micro_command_n, None)]
+    return [motor_forces(r, "end", r.felt_n["end"], None) if "end" in r.felt_n else Forces()]
 
 
 def _spring(stiffness_n_per_m: float, r: Recording) -> list[Forces]:
-    return _joint(-stiffness_n_per_m * _relative_m(r))
+    return _joint(r, -stiffness_n_per_m * _relative_m(r))
 
 
 def _damping(damping_n_s_per_m: float, r: Recording) -> list[Forces]:
-    return _joint(-damping_n_s_per_m * _rate(r))
+    return _joint(r, -damping_n_s_per_m * _rate(r))
 
 
 def _push(sign: float, stiffness_n_per_m: float, r: Recording) -> list[Forces]:
     depth_m = 0.0 if r.penetration_m is None else r.penetration_m
-    return _joint(np.where(r.side == sign, sign * stiffness_n_per_m * depth_m, 0.0))
+    return _joint(r, np.where(r.side == sign, sign * stiffness_n_per_m * depth_m, 0.0))
 
 
 def _edge(sign: float, stiffness_n_per_m: float, r: Recording) -> list[Forces]:
-    return _joint(np.where(r.side == sign, -sign * stiffness_n_per_m, 0.0))
+    return _joint(r, np.where(r.side == sign, -sign * stiffness_n_per_m, 0.0))
 
 
 def _existing(name: str, place: str, values: list[float], r: Recording) -> list[Forces]:
@@ -201,31 +202,31 @@ def _driven_under(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what a drive with all known effects of its command path makes of commands, N, as `driven` has it."""
     h, constant = r.log.period_s, r.belief(axis).force_constant_n_per_a
-    means_n, at_samples_n = driven(command_n, latch_s, lag_s, h)
+    _, at_samples_n = driven(command_n, latch_s, lag_s, h)
+    means_n = late_readings.motor_n(r.late, axis, r.log, command_n, latch_s, lag_s)
+    late_s = float(np.mean(late_readings.delay_s(r.late, axis, r.log)))
     place = "macro_command" if axis == "macro" else "micro_command"
     for row in (*r.believed.effects, *r.on_command):
         if row["acts_on"] == place:
             effect = CATALOGUE[row["name"]]
             values = [row[name] for name in effect.parameters]
             added_a, at_a = changed_by(effect, values, command_n / constant, latch_s, lag_s, h)
+            if late_s:
+                added_a, _ = changed_by(effect, values, command_n / constant, latch_s + late_s, lag_s, h)
             means_n, at_samples_n = means_n + constant * added_a, at_samples_n + constant * at_a
     return means_n, at_samples_n
 
 
-def _joint(force_on_end_n: np.ndarray) -> list[Forces]:
-    return [Forces(macro_n=-force_on_end_n, end_n=force_on_end_n)]
+def _joint(r: Recording, force_on_end_n: np.ndarray) -> list[Forces]:
+    return [between(r, force_on_end_n)]
 
 
 def _relative_m(r: Recording) -> np.ndarray:
-    if r.end is None:
-        raise KeyError("end")
-    return r.end.position_m - r.macro.position_m
+    return -relative_motion(r)[0]
 
 
 def _rate(r: Recording) -> np.ndarray:
-    if r.end is None:
-        raise KeyError("end")
-    return r.end.velocity_m_per_s - r.macro.velocity_m_per_s
+    return -relative_motion(r)[1]
 
 
 def effect_terms(recordings: Sequence[Recording], grids: dict[str, list[dict[str, float]]]) -> Iterator[Term]:
@@ -251,14 +252,22 @@ def effect_terms(recordings: Sequence[Recording], grids: dict[str, list[dict[str
 
 
 def periodic_terms(
-    recordings: Sequence[Recording], axis: str, pitches_m: list[float], frequencies_hz: list[float]
+    recordings: Sequence[Recording],
+    axis: str,
+    pitches_m: list[float],
+    driven_pitches_m: list[float],
+    frequencies_hz: list[float],
 ) -> Iterator[Term]:
-    """Yield the effects that have a pitch or a frequency, at those that stand out."""
+    """Yield the effects that have a pitch or a frequency, at those that stand out.
+
+    driven_pitches_m: what stands out in step with the motor's force, of which some laws are a share.
+    """
     side = "macro" if axis == "macro" else "micro"
-    found = {"pitch_m": pitches_m, "frequency_hz": frequencies_hz, "": []}
     for effect in CATALOGUE.values():
         if effect.origin and effect.name not in recordings[0].believed.own_effects:
             continue  # of another profile in this process
+        pitches = driven_pitches_m if "motor_force_n" in effect.quantities else pitches_m
+        found = {"pitch_m": pitches, "frequency_hz": frequencies_hz, "": []}
         for place in effect.places:
             if not place.startswith(side) or (place == "micro_force" and Trait.BASE in effect.traits):
                 continue

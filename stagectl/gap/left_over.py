@@ -6,6 +6,7 @@ import numpy as np
 
 from stagectl.gap.competition import Competition
 from stagectl.gap.normal_equations import Group, solve
+from stagectl.gap.selection import CURVE_GAIN
 
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
@@ -39,7 +40,7 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
             best, gained = curve, gain
     judge.trace.append(f"left over {left:.0f} of {first:.0f}, noise {noise:.0f}, best curve {gained:.0f}")
     floor = _LEFT_SDS * noise + _LEFT_SHARE * max(first, 0.0)
-    material = best is not None and gained > max(3.0 * judge.threshold, _CURVE_SHARE * max(first, 0.0))
+    material = best is not None and gained > max(CURVE_GAIN * judge.threshold, _CURVE_SHARE * max(first, 0.0))
     if not left > floor and not material:
         return None
     found: dict[str, Any] = {"left": left, "before": first, "gain": gained}

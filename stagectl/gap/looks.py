@@ -50,7 +50,7 @@ def looked_closely(
         say("once more, along the motion and at the place where the joint is now known to be")
         rough = look
         search = _under(rough.chosen, first, unsettled, noise, without, crew)
-        chosen = search.judge.select(search.kept)
+        chosen = search.judge.select(search.judge.reshaped(search.kept))
         at_size = remeasured(search, chosen, rough.named, search.moved) if search.moved else ()
         look = Look(search, chosen, at_size + all_named(search, chosen))
         gone = {(one.name, one.acts_on) for one in at_size if not stands(one, search.evidence.recordings[0])}

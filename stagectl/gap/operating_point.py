@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
-from stagectl.effects import Effect, Trait
+from stagectl.effects import Effect
 from stagectl.gap.balance import recording_of
 from stagectl.gap.believed import Believed
 from stagectl.gap.contact import CONTACT_DAMPING
+from stagectl.gap.late_readings import makes_late
 from stagectl.gap.quantities import along_motion, in_order, quantities
-from stagectl.gap.reading_errors import other_instants_s, reading_error_m
+from stagectl.gap.reading_errors import reading_error_m
 from stagectl.gap.recording import Recording
 
 Moved = tuple[Effect, str, dict[str, float]]
@@ -22,17 +22,16 @@ _CORRECTIONS = 2
 
 
 def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
-    """Return a recording with sensor errors taken out of its positions, edges where effects have put them, and drives
-    that make of their commands what effects of the command path do.
+    """Return a recording with sensor errors taken out of its positions, edges where effects have put them, drives that
+    make of their commands what effects of the command path do, and bodies that feel as late as they are read.
 
     What a sensor adds is taken along the readings at first, then along the motion that is left without it.
     """
     raw, believed = recording.log, recording.believed
-    on_command = tuple(
-        {"name": effect.name, "acts_on": place, **values}
-        for effect, place, values in moved
-        if place.endswith("_command")
-    )
+    rows = [{"name": effect.name, "acts_on": place, **values} for effect, place, values in moved]
+    on_command = tuple(row for row in rows if row["acts_on"].endswith("_command"))
+    late = tuple(row for row, (effect, *_) in zip(rows, moved, strict=True) if makes_late(effect))
+    misreading = [one for one in moved if one[1].endswith("_sensor") and not makes_late(one[0])]
     there = recording
     for effect, place, values in moved:
         if place == "contact_edge" and believed.joint is not None:
@@ -44,32 +43,25 @@ def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
                     np.mean(along_motion(effect, [sided[name] for name in effect.quantities], in_order(effect, values)))
                 )
             believed = _edges_out(believed, out_m[-1.0], out_m[1.0])
-    for number in range(_CORRECTIONS if any(place.endswith("_sensor") for _, place, _ in moved) else 1):
+    for number in range(_CORRECTIONS if misreading else 1):
         log = raw
-        for effect, place, values in moved:
+        for effect, place, values in misreading:
             parameters = in_order(effect, values)
             if place == "macro_sensor":
                 true_m = _true_m(there, log.macro_position_m, effect, place, parameters, number == 0)
                 log = replace(log, macro_position_m=true_m)
-            elif place == "end_sensor" and log.end_position_m is not None:
+            elif log.end_position_m is not None:
                 true_m = _true_m(there, log.end_position_m, effect, place, parameters, number == 0)
                 log = replace(log, end_position_m=true_m)
-        there = recording_of(log, believed, on_command)
+        there = recording_of(log, believed, on_command, late)
     return there
 
 
 def _true_m(
     recording: Recording, read_m: np.ndarray, effect: Effect, place: str, parameters: list[float], first: bool
 ) -> np.ndarray:
-    """Return readings without what a sensor effect adds; those of other instants are read where they are taken."""
-    error_m = reading_error_m(recording, effect, place, parameters, first)[:, 0]
-    if Trait.TIME_SHIFT not in effect.traits:
-        return read_m - error_m
-    times_s = recording.log.times_s
-    known = quantities(recording, "macro" if place.startswith("macro") else "end", place)
-    taken_s = other_instants_s(recording, effect, parameters, known, backwards=True)
-    inside = (taken_s >= times_s[0]) & (taken_s <= times_s[-1])
-    return np.where(inside, CubicSpline(times_s, read_m)(np.where(inside, taken_s, times_s)), read_m - error_m)
+    """Return readings without what a sensor effect adds."""
+    return read_m - reading_error_m(recording, effect, place, parameters, first)[:, 0]
 
 
 def with_joint_changed(recording: Recording, left_out_m: float, right_out_m: float, damping_ratio: float) -> Recording:

@@ -22,6 +22,10 @@ from stagectl.gap.log import STILL_M, Log, constant_columns
 from stagectl.gap.recording import Recording
 
 _BAND_HZ = (0.2, 30.0)
+_REACTION = (-0.1, 1.1)  # share of the micro's force that pushes the macro back, with room
+_AS_WELL_RATIO = (
+    1e-3  # of the squares of all inertia force: an explanation that leaves no more than that more is as good
+)
 _EDGE_S = 0.3
 _BLOCK_S = 0.25  # for the error of a factor; what is left is correlated for less
 _ACCELERATING_M_PER_S2 = 0.02  # rms; 0.01 to 0.7 in the recordings looked at
@@ -190,6 +194,9 @@ def _balance(recording: Recording, axis: str) -> _Balance:
                        rest[: count * block].reshape(count, block))  # fmt: skip
     covariance = normal @ (scores.T @ scores) @ normal
     whole = float(np.mean(inertia_n**2))
+    pushed = _pushed_rest_n(recording, axis, columns, inertia_n)
+    if pushed is not None and np.mean(pushed**2) < np.mean(rest**2) + _AS_WELL_RATIO * whole:
+        rest, solved[0] = pushed, scale[0]
     return _Balance(
         run=recording.log.name,
         axis=axis,
@@ -201,6 +208,22 @@ def _balance(recording: Recording, axis: str) -> _Balance:
         whole=whole,
         left=float(np.mean((inertia_n - force_n) ** 2)),
     )
+
+
+def _pushed_rest_n(recording: Recording, axis: str, columns: np.ndarray, inertia_n: np.ndarray) -> np.ndarray | None:
+    """Return what is left where the micro pushes the macro back and the forces are right; None where it can't.
+
+    While both move together that looks like a macro as heavy as both: a missing effect, and no other machine.
+    """
+    if axis != "macro" or recording.micro_command_n is None:
+        return None
+    back_n = -in_band(recording.micro_command_n.mean(axis=1), recording.log.period_s)
+    beside = np.column_stack([back_n, columns[:, 1:]])
+    unit = np.sqrt(np.mean(beside**2, axis=0)) + 1e-300
+    shares = np.linalg.lstsq(beside / unit, inertia_n - columns[:, 0], rcond=1e-10)[0]
+    if not _REACTION[0] <= shares[0] / unit[0] + recording.reaction_ratio <= _REACTION[1]:
+        return None
+    return inertia_n - columns[:, 0] - beside / unit @ shares
 
 
 def _check_swapped(believed: Believed, recordings: Sequence[Recording], balances: Sequence[_Balance]) -> None:

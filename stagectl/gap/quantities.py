@@ -6,7 +6,7 @@ from stagectl import compose
 from stagectl.effects import Effect
 from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.contact import side_stiffness_n_per_m
-from stagectl.gap.recording import Recording
+from stagectl.gap.recording import Recording, relative_motion
 
 
 def quantities(recording: Recording, axis: str, place: str) -> dict[str, np.ndarray]:
@@ -22,11 +22,9 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
     motion = recording.motion(axis)
     h = recording.log.period_s
     whole = np.ones_like(motion.position_m)
-    relative = recording.end if recording.end is not None else recording.macro
-    relative_m = relative.position_m - recording.macro.position_m
-    relative_m_per_s = relative.velocity_m_per_s - recording.macro.velocity_m_per_s
-    motor_n = recording.macro_command_n if axis == "macro" else recording.micro_command_n
-    motor_n = 0.0 * whole if motor_n is None else motor_n
+    x_b, x_b_rate = relative_motion(recording) if recording.end is not None else (0.0 * whole, 0.0 * whole)
+    relative_m, relative_m_per_s = -x_b, -x_b_rate
+    motor_n = recording.felt_n[axis]
     known = {
         "position_m": relative_m if kind == "joint" else motion.position_m,
         "velocity_m_per_s": relative_m_per_s if kind == "joint" else motion.velocity_m_per_s,

@@ -1,9 +1,8 @@
 """What an error of a sensor does: to its readings, and to the joint's forces that are taken at a wrong place. Pure."""
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
-from stagectl.effects import Effect, Trait
+from stagectl.effects import Effect
 from stagectl.gap.believed import BelievedJoint
 from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.contact import contact_at, contact_damping_n_s_per_m
@@ -17,14 +16,9 @@ _READING_PASSES = 2
 def reading_error_m(
     recording: Recording, effect: Effect, place: str, parameters: list[float], whole: bool
 ) -> np.ndarray:
-    """Return what a sensor effect adds to the readings, shape (n, 1); `whole`: along the motion without the error.
-
-    A delay T taken along the delayed motion is off by a T^2, which is what tells it from a lag.
-    """
+    """Return what a sensor effect adds to the readings, shape (n, 1); `whole`: along the motion without the error."""
     axis = "macro" if place.startswith("macro") else "end"
     known = quantities(recording, axis, place)
-    if Trait.TIME_SHIFT in effect.traits:
-        return _shifted_m(recording, effect, parameters, known, whole)
     error_m = along_motion(effect, [known[name] for name in effect.quantities], parameters)
     if not whole:
         return error_m
@@ -35,38 +29,6 @@ def reading_error_m(
         }
         error_m = along_motion(effect, [true[name] for name in effect.quantities], parameters)
     return error_m
-
-
-def _shifted_m(
-    recording: Recording, effect: Effect, parameters: list[float], known: dict[str, np.ndarray], whole: bool
-) -> np.ndarray:
-    """Return what readings of other instants are off by: the way between those instants and the samples' own.
-
-    A clock that is 27 ppm off is 3.8 ms late after 140 s, where two terms of a Taylor series miss by 0.3 um. The way is
-    that of the foretold velocity: between readings themselves an interpolation has less noise than they have, and any
-    delay of half a sample would gain by that.
-    """
-    times_s = recording.log.times_s
-    way = CubicSpline(times_s, known["velocity_m_per_s"][:, 0]).antiderivative()
-    other_s = other_instants_s(recording, effect, parameters, known, backwards=whole)
-    inside = (other_s >= times_s[0]) & (other_s <= times_s[-1])
-    further_m = way(np.where(inside, other_s, times_s)) - way(times_s)
-    series_m = along_motion(effect, [known[name] for name in effect.quantities], parameters)[:, 0]
-    return np.where(inside, -further_m if whole else further_m, series_m)[:, None]
-
-
-def other_instants_s(
-    recording: Recording, effect: Effect, parameters: list[float], known: dict[str, np.ndarray], *, backwards: bool
-) -> np.ndarray:
-    """Return the instants that samples are of; `backwards`: the instants of samples that are of their own ones.
-
-    What a law adds at a velocity of one and no acceleration is by how much later its reading is of.
-    """
-    still = {name: np.zeros_like(known[name]) for name in ("position_m", "acceleration_m_per_s2")}
-    moving = known | still | {"velocity_m_per_s": np.ones_like(known["velocity_m_per_s"])}
-    later_s = along_motion(effect, [moving[name] for name in effect.quantities], parameters)[:, 0]
-    times_s = recording.log.times_s
-    return times_s - np.interp(times_s - later_s, times_s, later_s) if backwards else times_s + later_s
 
 
 def moved_m(recording: Recording, effect: Effect, place: str, values: dict[str, float]) -> float:
@@ -115,7 +77,7 @@ def more_contact_n(
     """Return by how much the contact pushes the end more with x_b larger by `apart_m`, and edges moved outward."""
     if recording.end is None:
         raise KeyError("end")
-    x_b, x_b_rate = relative_motion(recording.macro, recording.end)
+    x_b, x_b_rate = relative_motion(recording)
     damping = contact_damping_n_s_per_m(recording.believed)
     there = contact_at(recording.believed, joint, x_b + apart_m, x_b_rate + apart_m_per_s, left_out_m, right_out_m)
     return there.push_n(joint, damping) - contact_of(recording).push_n(joint, damping)

@@ -1,14 +1,15 @@
 """One log with all that does not depend on a hypothesis: motion, motor forces, where the joint touches. Pure."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from stagectl.gap import late_readings
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.command_path import delayed, driven
 from stagectl.gap.contact import Contact, contact_at
 from stagectl.gap.innovations import Noise
+from stagectl.gap.late_readings import Row
 from stagectl.gap.log import Log
 from stagectl.gap.motion import Motion, motion_of
 
@@ -33,7 +34,10 @@ class Recording:
     judged: dict[str, np.ndarray]
     known: dict[tuple[str, str], dict[str, np.ndarray]]  # quantities by axis and kind of place, once asked for
     reported_a: dict[str, np.ndarray]  # reported minus believed current at the samples, by axis, where it is known
-    on_command: tuple[dict[str, Any], ...] = ()  # effects of the command path that were found, as rows of a profile
+    felt_n: dict[str, np.ndarray]  # motor forces on the clock of each body's readings, which may be late
+    now: dict[str, Motion]  # motion at the samples' own instants
+    on_command: tuple[Row, ...] = ()  # effects of the command path that were found, as rows of a profile
+    late: tuple[Row, ...] = ()  # effects that make readings those of earlier instants
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -83,27 +87,37 @@ class Recording:
 
 
 def put_together(
-    log: Log, believed: Believed, macro: Motion, end: Motion | None, on_command: tuple[dict[str, Any], ...] = ()
+    log: Log,
+    believed: Believed,
+    macro: Motion,
+    end: Motion | None,
+    on_command: tuple[Row, ...] = (),
+    late: tuple[Row, ...] = (),
 ) -> Recording:
     """Put together what is known along a motion; without one of the end, its own is made of the positions alone."""
     h = log.period_s
+    now = {"macro": late_readings.motion_now(late, "macro", log, macro)}
     macro_n, macro_at_n = driven(log.macro_command_n, believed.macro.latch_s, believed.macro.current_loop_s, h)
     at_samples_n = {"macro": macro_at_n}
+    felt_n = {"macro": _felt_n(late, "macro", log, log.macro_command_n, believed.macro, macro_n)}
     micro_n = depth = depth_rate = side = None
     if log.end_position_m is not None and log.micro_command_n is not None and believed.micro is not None:
         end = end or motion_of(log.end_position_m, h, believed.micro.noise_m)
         micro_n, at_samples_n["end"] = driven(
             log.micro_command_n, believed.micro.latch_s, believed.micro.current_loop_s, h
         )
+        felt_n["end"] = _felt_n(late, "end", log, log.micro_command_n, believed.micro, micro_n)
+        now["end"] = late_readings.motion_now(late, "end", log, end)
         if believed.joint is not None:
-            x_b, x_b_rate = relative_motion(macro, end)
+            x_b, x_b_rate = _apart(now["macro"], now["end"])
             contact = contact_at(believed, believed.joint, x_b, x_b_rate)
             side, depth, depth_rate = contact.side, contact.depth_m, contact.depth_rate_m_per_s
     else:
         end = None
     recording = Recording(
-        log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {}, on_command
-    )
+        log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {},
+        felt_n, now, on_command, late,
+    )  # fmt: skip
     for axis, reported_a in (("macro", log.macro_current_a), ("end", log.micro_current_a)):
         if axis in recording.axes and reported_a is not None and recording.belief(axis).current_noise_a is not None:
             believed_a = at_samples_n[axis] / recording.belief(axis).force_constant_n_per_a
@@ -118,6 +132,19 @@ def contact_of(recording: Recording) -> Contact:
     return Contact(side, depth_m, rate)
 
 
-def relative_motion(macro: Motion, end: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Return x_b = macro minus end on parts of intervals, and its rate."""
+def _felt_n(
+    late: tuple[Row, ...], axis: str, log: Log, command_n: np.ndarray, belief: BelievedAxis, motor_n: np.ndarray
+) -> np.ndarray:
+    """Return a motor's force on the clock of its body's readings."""
+    if not any(row["acts_on"] == f"{axis}_sensor" for row in late):
+        return motor_n
+    return late_readings.motor_n(late, axis, log, command_n, belief.latch_s, belief.current_loop_s)
+
+
+def relative_motion(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Return x_b = macro minus end at one instant, on parts of intervals, and its rate."""
+    return _apart(recording.now["macro"], recording.now["end"])
+
+
+def _apart(macro: Motion, end: Motion) -> tuple[np.ndarray, np.ndarray]:
     return macro.position_m - end.position_m, macro.velocity_m_per_s - end.velocity_m_per_s

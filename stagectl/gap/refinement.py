@@ -21,6 +21,11 @@ from stagectl.gap.normal_equations import Group, Placed, active_slots, covers, n
 from stagectl.gap.reading_errors import moved_m
 
 _SWEEPS = 2
+_MOST_SWEEPS = 7
+_SWEPT_GAIN = 1.0
+"""Squares of the noise that a sweep must gain for another one, narrower: of a ripple with 60 million of them a pitch
+that is 1e-4 off leaves a thousand."""
+
 _BRACKET = 2.2  # from the grid's place, up and down
 _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one turn over the travel
 _ANCHOR_M = 1.0
@@ -84,9 +89,12 @@ class Refiner:
             free = tuple(dict.fromkeys((*CATALOGUE[term.name].parameters[:1], *free)))
         shape = dict(term.shape)
         best = self._gain(term)
-        for sweep in range(_SWEEPS):
+        for sweep in range(_MOST_SWEEPS):
+            before = best
             for name in free:
                 shape, best = self._line(term, shape, name, best, 2.0 if entire and not sweep else 0.4**sweep)
+            if sweep + 1 >= _SWEEPS and not best - before > _SWEPT_GAIN:
+                break
         found = _with_shape(term, shape)
         if Trait.LATE_READING in CATALOGUE[found.name].traits and not found.linear:
             # what a latch may be off by is no effect of a sensor

@@ -66,7 +66,7 @@ def settled(
             Group(term.key, columns, term.scope, prior, term.bounds)
             for term, columns, prior in zip(terms, evidence.add_all(terms), sds, strict=True)
         ]
-        evidence.finish(np.array([sd for _, sd in parameters]), 0, 0)
+        evidence.finish(np.concatenate(sds), 0, 0)
         solution = solve(base, evidence.sums)
         moved = tuple(
             _changed(one, float(solution.of(group)[0][0]))

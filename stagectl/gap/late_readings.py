@@ -1,0 +1,145 @@
+"""Readings of other instants: what the body that is read feels, on the clock of its readings.
+
+    y(t) = x(t - T)  of  m x'' = u + f(x, x')  is  m y'' = (1 - T')^2 u(t - T) + f(y, y')
+
+A late body's own laws follow its readings and notice nothing. Motors and what lies between the bodies act on it T
+later; a lag of its sensor passes them through the same lag; a clock of its own is a T that grows. Taken as an error
+-v T of the readings it would bring the noise of v into them (21 nm into readings of 5), and a reversal would seem to
+tell a late sensor from a late motor, which it can't. Bodies meet at one instant: their relative position is of readings
+moved there. Pure.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from stagectl import compose
+from stagectl.effects import CATALOGUE, Effect, Trait
+from stagectl.gap.command_path import PARTS_COUNT, changed_by, driven, lagged
+from stagectl.gap.log import Log
+from stagectl.gap.motion import Motion
+
+Row = dict[str, Any]
+"""An effect as a row of a profile."""
+
+_LOOP_LAG = CATALOGUE["current_loop_lag"]
+_LATE = {Trait.LATE_READING, Trait.TIME_SHIFT}
+
+
+def makes_late(effect: Effect) -> bool:
+    """Tell whether readings with an effect are those of other instants."""
+    return not _LATE.isdisjoint(effect.traits)
+
+
+def _of(rows: Sequence[Row], axis: str) -> Iterator[tuple[Effect, list[float], bool]]:
+    """Yield (effect, parameters, whether it is a lag) of what makes one body's readings late."""
+    for row in rows:
+        if row["acts_on"] == f"{axis}_sensor":
+            effect = CATALOGUE[row["name"]]
+            yield effect, [row[name] for name in effect.parameters], bool(effect.memory)
+
+
+def _late_s(effect: Effect, parameters: list[float], t_s: np.ndarray) -> np.ndarray:
+    """Return how late readings are: what is missing of one that moves at 1 m/s."""
+    known = {name: np.zeros_like(t_s) for name in effect.quantities} | {"velocity_m_per_s": np.ones_like(t_s)}
+    known |= {"t_s": t_s} if "t_s" in known else {}
+    columns = np.column_stack([known[name] for name in effect.quantities])
+    still = columns.copy()
+    still[:, effect.quantities.index("velocity_m_per_s")] = 0.0
+    law, values = compose.along(effect), np.array([*parameters, 0.0])
+    return np.asarray(law(still, values, np.zeros(1))) - np.asarray(law(columns, values, np.zeros(1)))
+
+
+def delay_s(rows: Sequence[Row], axis: str, log: Log) -> np.ndarray:
+    """Return the dead time of one body's readings at every sample, shape (n,); lags are none."""
+    times_s = log.start_s + log.times_s
+    total = np.zeros(times_s.size)
+    for effect, parameters, is_lag in _of(rows, axis):
+        if not is_lag:
+            total += _late_s(effect, parameters, times_s)
+    return total
+
+
+def motor_n(
+    rows: Sequence[Row], axis: str, log: Log, command_n: np.ndarray, latch_s: float, loop_s: float
+) -> np.ndarray:
+    """Return what a late body feels of a motor, exactly, on parts of its intervals, shape (n, parts)."""
+    lags_s = [parameters[0] for _, parameters, is_lag in _of(rows, axis) if is_lag]
+    h = log.period_s
+
+    def made(latch_s: float) -> np.ndarray:
+        total_n, _ = driven(command_n, latch_s, loop_s, h)
+        for lag_s in lags_s:
+            total_n = total_n + changed_by(_LOOP_LAG, [lag_s], command_n, latch_s, loop_s, h)[0]
+        return total_n
+
+    return _at_delays(made, latch_s, delay_s(rows, axis, log), h)
+
+
+def _at_delays(made: Callable[[float], np.ndarray], latch_s: float, late_s: np.ndarray, period_s: float) -> np.ndarray:
+    """Return `made` of a latch that is later by what each interval has, on that interval.
+
+    While a step moves within one part the mean over it changes in proportion: between latches at the parts' borders a
+    straight line is exact.
+    """
+    if np.ptp(late_s) == 0.0:
+        return made(latch_s + float(late_s[0]))
+    part_s = period_s / PARTS_COUNT
+    at = (latch_s + late_s) / part_s
+    low = np.floor(at).astype(int)
+    share = at - low
+    out = np.zeros((late_s.size, PARTS_COUNT))
+    for node in range(int(low.min()), int(low.max()) + 2):
+        weight = np.where(low == node, 1.0 - share, 0.0) + np.where(low + 1 == node, share, 0.0)
+        here = weight > 0.0
+        if np.any(here):
+            out[here] += weight[here, None] * made(node * part_s)[here]
+    return out * (1.0 - np.gradient(late_s, period_s))[:, None] ** 2
+
+
+def felt_n(rows: Sequence[Row], axis: str, log: Log, force_n: np.ndarray) -> np.ndarray:
+    """Return what a late body feels of a force that is no step, on parts of its intervals, shape (n, parts)."""
+    for effect, parameters, is_lag in _of(rows, axis):
+        if is_lag:
+            force_n = lagged(force_n, parameters[0], log.period_s)[0]
+        else:
+            force_n = _shifted(force_n, effect, parameters, log)
+    return force_n
+
+
+def _shifted(force_n: np.ndarray, effect: Effect, parameters: list[float], log: Log) -> np.ndarray:
+    """Return means over parts of intervals of a force that comes later; its ends are held."""
+    part_s = log.period_s / force_n.shape[1]
+    edges = np.arange(force_n.size + 1, dtype=float)
+    impulse = np.concatenate([[0.0], np.cumsum(force_n.ravel())])
+    there = edges - _late_s(effect, parameters, log.start_s + part_s * edges) / part_s
+    inside = np.clip(there, 0.0, edges[-1])
+    beyond = (there - inside) * np.where(there < inside, force_n.flat[0], force_n.flat[-1])
+    moved = np.interp(inside, edges, impulse) + beyond
+    return (np.diff(moved) * np.diff(there)).reshape(force_n.shape)
+
+
+def motion_now(rows: Sequence[Row], axis: str, log: Log, motion: Motion) -> Motion:
+    """Return where a late body is at the samples' own instants, from its motion on the clock of its readings.
+
+    Behind a lag x = y + tau y', exactly; behind a delay it is what is read T later.
+    """
+    for effect, parameters, is_lag in _of(rows, axis):
+        x, v, a = motion.position_m, motion.velocity_m_per_s, motion.acceleration_m_per_s2
+        if is_lag:
+            motion = replace(motion, position_m=x + parameters[0] * v, velocity_m_per_s=v + parameters[0] * a)
+            continue
+        part_s = log.period_s / PARTS_COUNT
+        t_s = log.start_s + part_s * (np.arange(x.size) + 0.5)
+        late_s = _late_s(effect, parameters, t_s + _late_s(effect, parameters, t_s))
+        there = np.clip(np.arange(x.size) + np.rint(late_s / part_s).astype(int), 0, x.size - 1)
+        rest_s = late_s - part_s * (there - np.arange(x.size))
+        x, v, a = x.ravel()[there], v.ravel()[there], a.ravel()[there]
+        motion = replace(
+            motion,
+            position_m=(x + rest_s * v + 0.5 * rest_s**2 * a).reshape(motion.position_m.shape),
+            velocity_m_per_s=(v + rest_s * a).reshape(motion.position_m.shape),
+        )
+    return motion
