@@ -6,11 +6,11 @@ import numpy as np
 
 from stagectl.gap.competition import Competition
 from stagectl.gap.normal_equations import Group, solve
-from stagectl.gap.selection import CURVE_GAIN
+from stagectl.gap.selection import CURVE_GAIN, MATERIAL_RATIO
 
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
-_CURVE_SHARE = 0.03
+_CURVE_SHARE = MATERIAL_RATIO  # more than what an inexact law leaves
 
 
 def excess(search: Competition, chosen: list[Group]) -> float:
