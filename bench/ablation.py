@@ -12,6 +12,7 @@ from bench.figure import Bar, Figure, absent, judged
 from bench.scans import controller_of, scan, true_error_m
 from sim_backend.machine import Machine, load_machine
 from stagectl import trajectory
+from stagectl.adaptive_filter import at_rest, in_motion
 from stagectl.batch import simulation
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
@@ -31,11 +32,11 @@ _NO_STIFFNESS = 1e-9  # N/m
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One part of the law and how it is switched off; `asked_fed`: observer and rounding are fed what was asked."""
+    """One part of the law and how it is switched off: once, or behind every cycle."""
 
     name: str
     off: Callable[[Controller, Profile], None]
-    asked_fed: bool = False
+    behind_cycle: Callable[[Controller], None] | None = None
 
 
 def _nothing(controller: Controller, profile: Profile) -> None:
@@ -57,8 +58,26 @@ def _no_delay(controller: Controller, profile: Profile) -> None:
     controller.estimator["actuation_delay_s"] = _AT_ONCE_S
 
 
-def _no_unknown_force(controller: Controller, profile: Profile) -> None:
-    controller.estimator["micro_force_gain_n_per_m"] = 0.0
+def _no_unknown_force(controller: Controller) -> None:
+    controller.model["micro_disturbance_n"] = 0.0
+
+
+def _asked_fed(controller: Controller) -> None:
+    """Feed observer and rounding what was asked for."""
+    for axis in ("macro", "micro"):
+        step_n = float(controller.estimator[f"{axis}_amperes_per_word"][0])
+        step_n *= float(controller.belief[f"{axis}_force_constant_n_per_a"][0])
+        controller.estimator[f"{axis}_word"] = controller.command[f"{axis}_force_asked_n"] / step_n
+        controller.estimator[f"{axis}_carried_word"] = 0.0
+
+
+def _always_stiff(controller: Controller, profile: Profile) -> None:
+    in_motion(controller.estimator)
+
+
+def _always_soft(controller: Controller, profile: Profile) -> None:
+    at_rest(controller.estimator)
+    controller.estimator["filter_walk"] = controller.estimator["filter_rest_walk"]
 
 
 def _no_sliding(controller: Controller, profile: Profile) -> None:
@@ -78,9 +97,11 @@ def _no_adaptation(controller: Controller, profile: Profile) -> None:
 PARTS = (
     Part("whole", _nothing),
     Part("no contact prediction", _no_contact),
-    Part("asked force fed, not the integer sent", _nothing, asked_fed=True),
+    Part("asked force fed, not the integer sent", _nothing, _asked_fed),
     Part("no delay compensation", _no_delay),
-    Part("no unknown force", _no_unknown_force),
+    Part("no unknown force", _nothing, _no_unknown_force),
+    Part("observer always as stiff as in motion", _always_stiff),
+    Part("observer always as soft as at rest", _always_soft),
     Part("no sliding part (k = 0)", _no_sliding),
     Part("no integral in the surface", _no_integral),
     Part("no adaptation", _no_adaptation),
@@ -148,24 +169,24 @@ def _worst(errors: list[np.ndarray], setpoints: np.ndarray, rate_hz: float) -> t
 def _errors(part: Part, profile: Profile, machine: Machine, setpoints: np.ndarray, seed: int) -> np.ndarray:
     controller = controller_of(profile, "dsmc")
     part.off(controller, profile)
-    if part.asked_fed:
-        return _with_asked_fed(controller, profile, machine, setpoints, seed)
+    if part.behind_cycle is not None:
+        return _with_cycles(part.behind_cycle, controller, profile, machine, setpoints, seed)
     return true_error_m(scan(controller, profile, machine, setpoints, seed), setpoints)
 
 
-def _with_asked_fed(
-    controller: Controller, profile: Profile, machine: Machine, setpoints: np.ndarray, seed: int
+def _with_cycles(
+    behind_cycle: Callable[[Controller], None],
+    controller: Controller,
+    profile: Profile,
+    machine: Machine,
+    setpoints: np.ndarray,
+    seed: int,
 ) -> np.ndarray:
-    """Follow in Python, where the observer's words can be changed behind every cycle: error at the samples."""
+    """Follow in Python, where the controller can be changed behind every cycle: error at the samples."""
     one = simulation(controller, machine, latch_delay_s=profile.cycle.actuation_delay_s, seed=seed)
     start_m = float(setpoints["position_m"][0])
     one.state["end_position_m"] = start_m
     one.state["macro_position_m"] = start_m + float(gap_centre(controller.belief[0]))
-    steps_n = {
-        axis: float(controller.estimator[f"{axis}_amperes_per_word"][0])
-        * float(controller.belief[f"{axis}_force_constant_n_per_a"][0])
-        for axis in ("macro", "micro")
-    }
     loop = Loop(one)
     rest = np.zeros(round(profile.cycle.rate_hz), setpoints.dtype)
     rest["position_m"] = start_m
@@ -174,8 +195,6 @@ def _with_asked_fed(
         loop.cycle(setpoint)
         if loop.stop:
             raise RequestError(f"machine {machine.name}, seed {seed}: stop {loop.stop}")
-        for axis, step_n in steps_n.items():
-            controller.estimator[f"{axis}_word"] = controller.command[f"{axis}_force_asked_n"] / step_n
-            controller.estimator[f"{axis}_carried_word"] = 0.0
+        behind_cycle(controller)
         error_m.append(loop.true_end_m - setpoint["position_m"])
     return np.array(error_m[rest.size :])

@@ -5,6 +5,7 @@ stiffness off by 1 % and contact damping by 20 %, up or down; "calibrated" ones 
 leaves them. Machines keep their cogging, cable and force noise, which no profile knows. Bars are written here.
 """
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,12 +16,14 @@ from bench.figure import Bar, Figure, judged
 from bench.following import peak, rms
 from sim_backend.machine import Machine, load_machine
 from stagectl import batch, tick, trajectory
+from stagectl.adaptive_filter import at_rest, in_motion, stiffening
 from stagectl.laws.reference import gap_centre
 from stagectl.linear_loop import GAP, LEFT, RIGHT, linearise, machine_body
 from stagectl.margins import margins
 from stagectl.metrics import moving_average_and_deviation
 from stagectl.profile import Profile, load_profile
 from stagectl.signals import SETPOINT, Stop
+from tests.stage_loop import Loop
 
 STAGE = "oled-printer"
 SEEDS = (1, 2, 3, 4, 5)
@@ -39,10 +42,13 @@ DEVIATION = Bar("control, scan 0.2 m/s, calibrated: MSD over 20 ms, largest", "n
 AVERAGE_WRONG = Bar("the same, 1 % wrong: abs(MA), from the first window of constant speed", "nm")
 STIFFNESS = Bar("control, contact-free, contact stiffness x1 to x1000: peaks differ by", "%", 10.0)
 SATURATED = Bar("control, contact x10: peak 0.3 s after a start that saturates", "nm", 100.0)
-SENSITIVITY = Bar("control, Ms at the micro's force, gap and both contacts, adaptive gain at its ceiling", "1", 2.0)
+SENSITIVITY = Bar(
+    "control, Ms at the micro's force, gap and both contacts, adaptive gains at floor and ceiling", "1", 2.0
+)
 DELAY_MARGIN = Bar("control, delay margin, least of the same", "ms", 0.8, at_least=True)
+STEP = Bar("control, 0.1 N at once on the resting end: peak of the mean over machines and seeds", "nm")
 MASS = Bar("control, micro's mass 10 % up and down, gap and contact: largest pole", "1", 1.0)
-CROSSOVER = Bar("control, crossover in the gap", "Hz")
+CROSSOVER = Bar("control, crossover in the gap, where a force moves the end", "Hz")
 AS_SHIPPED = Bar("control, Ms at the profile's own delay", "1")
 
 Say = Callable[[str], None]
@@ -51,6 +57,9 @@ _RATIOS = {"wrong": ((1.01, 1.2), (0.99, 0.8)), "calibrated": ((1.001, 1.05), (0
 _STIFFNESSES = (1.0, 10.0, 100.0, 1000.0)
 _WINDOW_S = 0.02
 _SETTLED_M = 50e-9
+_STIFFENING_SAMPLES = (2, 4, 6, 8, 10, 12, 16, 24)  # after a force has struck: gains on their way count too
+_STEP_N = 0.1
+_STEP_S = 0.3
 _SURGE_M_PER_S = 0.02
 """Speed that a reference begins with at once: 40 kg would need an endless force."""
 
@@ -109,6 +118,21 @@ def machine(profile: Profile, ratio: float = 1.0, damping_ratio: float = 1.0, st
         if row["name"] == "contact_damping":
             row["damping_n_s_per_m"] = damping
     return with_tables(one, **tables).model_copy(update={"effects": effects})
+
+
+def after_step_m(profile: Profile, one: Machine, seed: int) -> np.ndarray:
+    """Rest, then put `_STEP_N` on the micro that nobody told the controller of: true error at the samples after, m."""
+    controller = tick.controller(profile, profile.control.law, has_drives=False)
+    simulation = batch.simulation(controller, one, latch_delay_s=profile.cycle.actuation_delay_s, seed=seed)
+    simulation.state["end_position_m"] = 0.0
+    simulation.state["macro_position_m"] = float(gap_centre(controller.belief[0]))
+    hold = np.zeros(round(_REST_S * profile.cycle.rate_hz), SETPOINT)
+    batch.run(simulation, hold)
+    loop, error_m = Loop(simulation), []
+    for setpoint in hold[: round(_STEP_S * profile.cycle.rate_hz)]:
+        loop.cycle(setpoint, added_micro_n=_STEP_N)
+        error_m.append(loop.true_end_m)
+    return np.array(error_m)
 
 
 def machines(profile: Profile, kind: str) -> list[Machine]:
@@ -217,13 +241,18 @@ def _margins() -> Iterator[Figure]:
     ceiling = profile.control.adaptive_gain_ceiling_ratio
     found, poles = [], []
     for place in (GAP, LEFT, RIGHT):
-        for gain in (0.0, ceiling):
+        for gain, observer in itertools.product((0.0, ceiling), (at_rest, in_motion)):
             body = machine_body(machine(profile))
-            found.append(margins(linearise(profile, profile.control.law, body, place, gain)))
+            found.append(margins(linearise(profile, profile.control.law, body, place, gain, observer)))
             for ratio in (0.9, 1.1):
                 body = machine_body(with_tables(machine(profile), micro={"mass_kg": ratio * _micro_kg(profile)}))
-                loop = linearise(profile, profile.control.law, body, place, gain).closed()
+                loop = linearise(profile, profile.control.law, body, place, gain, observer).closed()
                 poles.append(float(np.max(np.abs(loop.poles()))))
+    body = machine_body(machine(profile))
+    found += [
+        margins(linearise(profile, profile.control.law, body, GAP, ceiling, stiffening(samples)))
+        for samples in _STIFFENING_SAMPLES
+    ]
     worst = max(found, key=lambda one: one.sensitivity_peak_ratio)
     remark = f"at {worst.sensitivity_peak_hz:.0f} Hz; one cycle of delay; test_linear_loop confirms it by a sine"
     yield judged(SENSITIVITY, worst.sensitivity_peak_ratio, reason=remark)
@@ -231,7 +260,9 @@ def _margins() -> Iterator[Figure]:
     yield judged(MASS, max(poles), reason="of the closed loop; within the unit circle it is stable")
     phase = np.degrees(min(one.phase_margin_rad for one in found))
     gain = min(one.gain_margin_ratio for one in found)
-    yield judged(CROSSOVER, found[0].crossover_hz, reason=f"phase margin {phase:.0f} deg, gain margin {gain:.2f}")
+    low, high = (found[k].crossover_hz for k in (0, 1))
+    said = f"{low:.0f} Hz at rest; phase margin {phase:.0f} deg, gain margin {gain:.2f}"
+    yield judged(CROSSOVER, high, reason=said)
     shipped = load_profile(STAGE)
     loop = linearise(shipped, "dsmc", machine_body(machine(shipped)), GAP, ceiling)
     delay_us = 1e6 * shipped.cycle.actuation_delay_s
@@ -253,6 +284,8 @@ def _rows(profile: Profile, seeds: Sequence[int], who: str) -> Iterator[Figure]:
     yield judged(_named(HOLD, who), 1e9 * max(rms(one.error_m) for one in held), used)
     if not who:
         yield judged(HOLD_MEASURED, 1e9 * max(rms(one.measured_m) for one in held), used)
+    pushed_m = np.mean([after_step_m(profile, one, seed) for one in machines(profile, "wrong") for seed in seeds], 0)
+    yield judged(_named(STEP, who), 1e9 * peak(pushed_m), used, "seeds and machines as above")
     for bar, kind in ((FREE_WRONG, "wrong"), (FREE_CALIBRATED, "calibrated")):
         followed = runs(profile, kind, trapezoid(), seeds)
         touched = any(np.any(one.touched) for one in followed)

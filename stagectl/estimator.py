@@ -2,9 +2,9 @@
 
 The believed machine is the same plant code as the simulator's, composed with the profile's effects. Between
 two samples it feels the integers that were sent: the old command until the SYNC that latches the new one, then
-the new one. A sample corrects position, velocity and an unknown force on each axis (a random walk), with the
-steady-state gains of the Kalman filter for that model; a notch keeps a flexible mode out of them where the profile has
-one. Prediction from the sample's instant to the instant the
+the new one. A sample corrects position, velocity and an unknown force on each axis (a random walk): with steady-state
+Kalman gains on a macro that carries a micro, by the adaptive filter on the axis that carries the end; a notch keeps a
+flexible mode out of that one where the profile has one. Prediction from the sample's instant to the instant the
 next command acts, lag and dead time of the profile's command effects included, is the same code run ahead. Pure;
 knows no bus and no clock.
 """
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stagectl import compose, notch
+from stagectl import adaptive_filter, compose, notch
 from stagectl.compiled import compiled
 from stagectl.plant import PLANT_PARAMETERS, PLANT_STATE
 from stagectl.signals import Record
@@ -31,12 +31,9 @@ ESTIMATOR = np.dtype(
         ("bridged_samples_max", "f8"),  # missing in a row that the identification's filters are carried over
         ("macro_amperes_per_word", "f8"),
         ("micro_amperes_per_word", "f8"),
-        ("macro_position_gain_ratio", "f8"),
+        ("macro_position_gain_ratio", "f8"),  # where it carries a micro
         ("macro_velocity_gain_per_s", "f8"),
         ("macro_force_gain_n_per_m", "f8"),
-        ("micro_position_gain_ratio", "f8"),
-        ("micro_velocity_gain_per_s", "f8"),
-        ("micro_force_gain_n_per_m", "f8"),
         ("position_mode", "f8"),  # 1 where the macro's drive closes its own position loop (CSP with torque offset)
         ("started", "f8"),
         ("cycle", "f8"),  # of the last tick
@@ -53,7 +50,8 @@ ESTIMATOR = np.dtype(
         ("end_seen_m", "f8"),
         ("macro_innovation_m", "f8"),
         ("end_innovation_m", "f8"),
-        *notch.FIELDS,  # of the axis that carries the end
+        *adaptive_filter.FIELDS,  # of the axis that carries the end
+        *notch.FIELDS,
     ]
 )
 
@@ -88,35 +86,6 @@ def belief(profile: "Profile") -> np.ndarray:
     return q
 
 
-def kalman_gains(mass_kg: float, period_s: float, noise_m: float, drift_n_per_sqrt_s: float) -> np.ndarray:
-    """Return the steady-state gains on (position, velocity, unknown force) of a mass under a random-walk force.
-
-    Iterates the Riccati equation of x' = v, v' = w / m, w a random walk of the given density, with position
-    noise `noise_m` a sample (Kalman 1960; Anderson, Moore, Optimal Filtering, chapter 4).
-    """
-    h = period_s
-    a = np.array([[1.0, h, h * h / (2 * mass_kg)], [0.0, 1.0, h / mass_kg], [0.0, 0.0, 1.0]])
-    g = np.array([h**3 / (6 * mass_kg), h**2 / (2 * mass_kg), h])
-    noise = np.outer(g, g) / h * drift_n_per_sqrt_s**2
-    r = noise_m**2
-    # scaled so that all states are of order one; a fixed point is found well within these steps
-    scale = np.array([noise_m, noise_m / h, noise_m * mass_kg / h**2])
-    a = a * scale[None, :] / scale[:, None]
-    noise = noise / np.outer(scale, scale)
-    r = r / noise_m**2
-    p = np.eye(3)
-    gain = np.zeros(3)
-    for _ in range(20000):
-        p = a @ p @ a.T + noise
-        new_gain = p[:, 0] / (p[0, 0] + r)
-        p = p - np.outer(new_gain, p[0, :])
-        p = 0.5 * (p + p.T)
-        if np.max(np.abs(new_gain - gain)) < 1e-12 * np.max(np.abs(new_gain)):
-            break
-        gain = new_gain
-    return gain * scale / scale[0]
-
-
 def init(profile: "Profile") -> np.ndarray:
     """Make ESTIMATOR for a profile: gains from its noise and drift densities, nothing seen yet."""
     e = np.zeros(1, ESTIMATOR)
@@ -133,12 +102,16 @@ def init(profile: "Profile") -> np.ndarray:
     control = profile.control
     notch.init(e, profile)
     e["macro_amperes_per_word"] = 1e-3 * profile.macro.rated_current_a
-    gains = kalman_gains(profile.macro.mass_kg, period_s, noise_m, control.macro_drift_n_per_sqrt_s)
-    e["macro_position_gain_ratio"], e["macro_velocity_gain_per_s"], e["macro_force_gain_n_per_m"] = gains
-    if profile.micro is not None:
+    precise, rest_ratio = profile.axis(profile.axes[-1]), control.rest_drift_ratio
+    if profile.micro is None:
+        drift = control.macro_drift_n_per_sqrt_s
+    else:
+        drift = control.micro_drift_n_per_sqrt_s
         e["micro_amperes_per_word"] = 1e-3 * profile.micro.rated_current_a
-        gains = kalman_gains(profile.micro.mass_kg, period_s, noise_m, control.micro_drift_n_per_sqrt_s)
-        e["micro_position_gain_ratio"], e["micro_velocity_gain_per_s"], e["micro_force_gain_n_per_m"] = gains
+        e["macro_position_gain_ratio"], e["macro_velocity_gain_per_s"], e["macro_force_gain_n_per_m"] = (
+            adaptive_filter.steady_gains(period_s, profile.macro.mass_kg, noise_m, control.macro_drift_n_per_sqrt_s)
+        )
+    adaptive_filter.init(e, period_s, precise.mass_kg, noise_m, drift, rest_ratio, precise.force_noise_n)
     return e
 
 
@@ -160,6 +133,7 @@ def start(e: Record, s: Record, m: Record) -> None:
     s.macro_disturbance_n = 0.0
     s.micro_disturbance_n = 0.0
     s.memory[:] = 0.0
+    e.filter_mean_m = 0.0
     e.cycle = m.cycle
     e.started = 1.0
 
@@ -169,18 +143,22 @@ def correct(e: Record, s: Record, q: Record, macro_position_m: float, end_positi
     """Take a fresh sample into the believed machine."""
     innovation = macro_position_m - s.macro_position_m
     e.macro_innovation_m = innovation
-    if q.has_micro == 0.0:
-        innovation = notch.passed(e, innovation)
-    s.macro_position_m += e.macro_position_gain_ratio * innovation
-    s.macro_velocity_m_per_s += e.macro_velocity_gain_per_s * innovation
-    s.macro_disturbance_n += e.macro_force_gain_n_per_m * innovation
     if q.has_micro != 0.0:
+        s.macro_position_m += e.macro_position_gain_ratio * innovation
+        s.macro_velocity_m_per_s += e.macro_velocity_gain_per_s * innovation
+        s.macro_disturbance_n += e.macro_force_gain_n_per_m * innovation
         innovation = end_position_m - s.end_position_m
         e.end_innovation_m = innovation
         innovation = notch.passed(e, innovation)
-        s.end_position_m += e.micro_position_gain_ratio * innovation
-        s.end_velocity_m_per_s += e.micro_velocity_gain_per_s * innovation
-        s.micro_disturbance_n += e.micro_force_gain_n_per_m * innovation
+        adaptive_filter.step(e, innovation)
+        s.end_position_m += e.precise_position_gain_ratio * innovation
+        s.end_velocity_m_per_s += e.precise_velocity_gain_per_s * innovation
+        s.micro_disturbance_n += e.precise_force_gain_n_per_m * innovation
     else:
+        innovation = notch.passed(e, innovation)
+        adaptive_filter.step(e, innovation)
+        s.macro_position_m += e.precise_position_gain_ratio * innovation
+        s.macro_velocity_m_per_s += e.precise_velocity_gain_per_s * innovation
+        s.macro_disturbance_n += e.precise_force_gain_n_per_m * innovation
         s.end_position_m = s.macro_position_m
         s.end_velocity_m_per_s = s.macro_velocity_m_per_s

@@ -6,14 +6,14 @@ gap, or in contact on one side), so differences of any size give the same; y(e) 
 Inputs and outputs are named and in SI units. What the two ends of a broken loop give is `stagectl.margins`' matter.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stagectl import compose, estimator, notch, plant
+from stagectl import adaptive_filter, compose, estimator, notch, plant
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
 from stagectl.laws.reference import gap_centre
@@ -180,9 +180,16 @@ class Linearised:
 
 
 def linearise(
-    profile: "Profile", law: str, body: Body, place: int = GAP, adaptive_gain_ratio: float = 0.0
+    profile: "Profile",
+    law: str,
+    body: Body,
+    place: int = GAP,
+    adaptive_gain_ratio: float = 0.0,
+    observer: Callable[[np.ndarray], None] = adaptive_filter.in_motion,
 ) -> Linearised:
     """Linearise a profile's controller about e = 0 with this adaptive gain, and a body at the same place.
+
+    `observer` brings it to where it is judged: as a force leaves it, or `adaptive_filter.at_rest`.
 
     RequestError where the macro's drive closes its own loop, or an effect's dead time has no small differences.
     """
@@ -196,6 +203,7 @@ def linearise(
     for axis in axes:
         one.estimator[f"{axis}_amperes_per_word"] *= _FINE_RATIO
     one.law["adaptive_gain_ratio"] = adaptive_gain_ratio
+    observer(one.estimator)
     amperes_per_n = np.array([1.0 / float(one.belief[f"{axis}_force_constant_n_per_a"][0]) for axis in axes])
     amperes_per_word = np.array([float(one.estimator[f"{axis}_amperes_per_word"][0]) for axis in axes])
     tick, states = _tick_map(one, LAWS[law].LINEAR_STATES, axes, place, _memory_count(profile.effects))

@@ -127,6 +127,7 @@ class Axis(Table):
     thermal_force_n: Force
     thermal_time_constant_s: Annotated[float, within(0.1, 1e5)]
     current_loop_s: Annotated[float, within(1e-6, 0.02)]
+    force_noise_n: Annotated[float, within(0.0, 1e3)] = 0.0  # rms of a cycle, amplifier and jitter of the SYNC
     stop: Literal["ramp", "short", "coast"]
 
     @property
@@ -310,6 +311,7 @@ class Control(Table):
     adaptive_gain_ceiling_ratio: Annotated[float, within(0.0, 10.0)] = 0.5
     macro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 5.0
     micro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 0.2
+    rest_drift_ratio: Annotated[float, within(1e-3, 1.0)] = 1.0  # of the drift, where the end's innovations are noise
     notch_frequency_hz: Annotated[float, within(0.0, 1e4)] = 0.0  # of the observer; 0 = none
     notch_damping_ratio: Annotated[float, within(0.01, 2.0)] = 0.3  # how wide
     notch_depth_ratio: Annotated[float, within(0.0, 1.0)] = 0.1  # what is left in the middle

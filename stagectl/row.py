@@ -40,6 +40,7 @@ ESTIMATES = (
     "contact_force_estimate_n",
     "sliding_variable_m_per_s",
     "adaptive_gain_ratio",
+    "unrest_ratio",
     "backlash_left_m",
     "backlash_right_m",
     "backlash_left_stiffness_n_per_m",

@@ -16,6 +16,7 @@ _ESTIMATES = {
     "contact_force_estimate_n": "s.contact_force_n",
     "sliding_variable_m_per_s": "l.sliding_variable_m_per_s",
     "adaptive_gain_ratio": "l.adaptive_gain_ratio",
+    "unrest_ratio": "x.unrest_ratio",
     "backlash_left_m": "b.left_m",
     "backlash_right_m": "b.right_m",
     "backlash_left_stiffness_n_per_m": "b.left_stiffness_n_per_m",
@@ -83,11 +84,12 @@ def _row_source() -> list[str]:
     """Write the copies of a row out, one line a field: compiled code can't loop over names."""
     lines = [
         "@compiled",
-        f"def fill_row(row, measurement, setpoint, command, model, law, backlash, {', '.join(_LOOP)}):",
+        f"def fill_row(row, measurement, setpoint, command, estimator, model, law, backlash, {', '.join(_LOOP)}):",
         "    r = row[0]",
         "    m = measurement[0]",
         "    t = setpoint[0]",
         "    c = command[0]",
+        "    x = estimator[0]",
         "    s = model[0]",
         "    l = law[0]",
         "    b = backlash[0]",
@@ -139,6 +141,6 @@ _MODULE = compose.generated_module(
 )
 
 fill_row = _MODULE.fill_row
-"""fill_row(row, measurement, setpoint, command, model, law, backlash, ...): one-element arrays, then `_LOOP`."""
+"""fill_row(row, measurement, setpoint, command, estimator, model, law, backlash, ...): one element each, `_LOOP`."""
 fill_status = _MODULE.fill_status
 """fill_status(status, measurement, setpoint, hold, backlash, ...): one-element arrays, then `_STATED`."""

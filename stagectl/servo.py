@@ -641,7 +641,7 @@ class Servo:
         bytes_[:] = self._fresh_bytes
         count = len(inbox.sensor_bytes)
         fill_row(
-            self.row, one.measurement, tracker.setpoint, one.command, one.model, one.law, one.backlash,
+            self.row, one.measurement, tracker.setpoint, one.command, one.estimator, one.model, one.law, one.backlash,
             int(self.phase), lateness_ns, tick_ns, sync_end_t_ns,
             inbox.first_arrival_t_ns, inbox.first_bytes_count, inbox.sensor_arrival_t_ns, count,
             macro_word, micro_word, decoder.macro_counts, decoder.end_counts, tracker.law_number,

@@ -112,7 +112,7 @@ def _warm(profile: Profile) -> None:
         tracker.switch(law)
         one = tracker.active
         fill_row(
-            row, one.measurement, tracker.setpoint, one.command, one.model, one.law, one.backlash,
+            row, one.measurement, tracker.setpoint, one.command, one.estimator, one.model, one.law, one.backlash,
             0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 1.0,
         )  # fmt: skip
     fill_status(

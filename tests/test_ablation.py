@@ -50,9 +50,9 @@ def test_every_part_changes_a_state_of_its_own(oled_profile):
                 value[field] if field else value, fresh[name][field] if field else fresh[name], equal_nan=True
             )
         )
-        assert one.asked_fed or changed
-        assert (changed, one.asked_fed) not in seen
-        seen.add((changed, one.asked_fed))
+        assert one.behind_cycle or changed
+        assert (changed, one.behind_cycle) not in seen
+        seen.add((changed, one.behind_cycle))
 
 
 def test_a_part_that_the_stage_can_t_do_without_is_said_not_shown(whole, oled_profile, oled_machine):

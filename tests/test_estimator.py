@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from stagectl import batch, estimator, trajectory
+from stagectl import adaptive_filter, batch, estimator, trajectory
 from stagectl.signals import MEASUREMENT, SETPOINT
 from tests.stage import believed, centre_m, simulated, with_values
 from tests.stage_loop import Loop
@@ -28,14 +28,13 @@ def riccati_gains(mass_kg, period_s, noise_m, drift_n_per_sqrt_s):
     ("mass_kg", "noise_m", "drift"), [(70.0, 5e-9, 5.0), (40.0, 5e-9, 0.2), (40.0, 100e-9, 0.2), (12.0, 23e-9, 5.0)]
 )
 def test_gains_solve_the_riccati_equation(mass_kg, noise_m, drift):
-    """The code lets the force change in a line over a period, scipy at any instant of it: 0.6 % apart at most."""
-    ours = estimator.kalman_gains(mass_kg, 1e-3, noise_m, drift)
-    np.testing.assert_allclose(ours, riccati_gains(mass_kg, 1e-3, noise_m, drift), rtol=1e-2)
+    ours = adaptive_filter.steady_gains(1e-3, mass_kg, noise_m, drift)
+    np.testing.assert_allclose(ours, riccati_gains(mass_kg, 1e-3, noise_m, drift), rtol=1e-4)
 
 
 def test_gains_are_of_a_stable_filter_and_follow_the_noise():
-    quiet = estimator.kalman_gains(40.0, 1e-3, 5e-9, 0.2)
-    loud = estimator.kalman_gains(40.0, 1e-3, 100e-9, 0.2)
+    quiet = adaptive_filter.steady_gains(1e-3, 40.0, 5e-9, 0.2)
+    loud = adaptive_filter.steady_gains(1e-3, 40.0, 100e-9, 0.2)
     assert np.all(quiet > loud)
     assert np.all(loud > 0.0)
     assert quiet[0] < 1.0
@@ -108,7 +107,7 @@ def test_missing_samples_are_predicted(oled_profile, oled_machine, gap, comes):
         x = loop.simulation.controller.estimator[0]
         behind = 1 if comes == "late" else k % 20 + 1
         assert x["predicted_samples"] == (behind if missing else 0)
-        assert x["end_seen_m"] == pytest.approx(loop.true_end_m, abs=1e-12)
+        assert x["end_seen_m"] == pytest.approx(loop.true_end_m, abs=2e-12)
         assert x["macro_seen_m"] == pytest.approx(loop.true_macro_m, abs=1e-12)
     assert loop.stop == 0
 
@@ -136,7 +135,7 @@ def test_missed_cycles_are_caught_up(oled_profile, oled_machine):
         else:
             loop.cycle(setpoint)
             model = loop.simulation.controller.model[0]
-            assert model["end_position_m"] == pytest.approx(loop.true_end_m, abs=1e-12)
+            assert model["end_position_m"] == pytest.approx(loop.true_end_m, abs=2e-12)
             assert model["macro_position_m"] == pytest.approx(loop.true_macro_m, abs=1e-12)
     assert loop.stop == 0
 
@@ -147,7 +146,7 @@ def test_a_command_that_was_lost_was_not_felt(oled_profile, oled_machine):
     for k, setpoint in enumerate(moves("trapezoid")[:1600]):
         loop.cycle(setpoint, lost=k in (1200, 1250, 1251))
         model = loop.simulation.controller.model[0]
-        assert model["end_position_m"] == pytest.approx(loop.true_end_m, abs=1e-12)
+        assert model["end_position_m"] == pytest.approx(loop.true_end_m, abs=2e-12)
     assert loop.stop == 0
 
 
@@ -168,7 +167,7 @@ def test_one_axis_observes_its_end_as_its_macro(single_profile, single_machine):
     model, x = simulation.controller.model[0], simulation.controller.estimator[0]
     assert model["end_position_m"] == model["macro_position_m"]
     assert model["end_velocity_m_per_s"] == model["macro_velocity_m_per_s"] != 0.0
-    assert x["micro_position_gain_ratio"] == x["end_innovation_m"] == 0.0
+    assert x["macro_position_gain_ratio"] == x["end_innovation_m"] == 0.0
     assert abs(x["macro_innovation_m"]) < 100e-9
 
 

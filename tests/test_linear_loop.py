@@ -7,6 +7,7 @@ import pytest
 
 from sim_backend.machine import load_machine
 from stagectl import batch, margins
+from stagectl.adaptive_filter import at_rest, in_motion
 from stagectl.errors import RequestError
 from stagectl.linear_loop import (
     GAP,
@@ -130,15 +131,24 @@ def test_poles_leave_the_unit_circle_at_the_delay_margin(law):
     assert not loop.closed(margin_s + 20e-6).is_stable()
 
 
+def kept(estimator, observer) -> None:
+    """Bring an observer to where it is and let no innovation move it from there."""
+    observer(estimator)
+    if observer is at_rest:
+        estimator["filter_walk"] = estimator["filter_rest_walk"]
+
+
+@pytest.mark.parametrize("observer", [at_rest, in_motion])
 @pytest.mark.parametrize("law", ["dsmc", "pid"])
-def test_at_the_gain_margin_the_value_seam_begins_to_ring(law):
+def test_at_the_gain_margin_the_value_seam_begins_to_ring(law, observer):
     """A motor that is stronger by the margin and 5 % makes noise grow; at 5 % less than the margin it does not."""
     profile, machine = load_profile("oled-printer"), load_machine("oled-printer")
-    ratio = margins.margins(linearise(profile, law, machine_body(machine))).gain_margin_ratio
+    ratio = margins.margins(linearise(profile, law, machine_body(machine), observer=observer)).gain_margin_ratio
     peaks_m = []
     for share in (0.95, 1.05):
         constant = machine.micro.force_constant_n_per_a * ratio * share
         simulation = simulated(profile, with_values(machine, micro__force_constant_n_per_a=constant), law)
+        kept(simulation.controller.estimator, observer)
         recording = batch.run(simulation, np.zeros(3000, SETPOINT))
         stopped = recording.commands["stop"][-1] != 0
         peaks_m.append(math.inf if stopped else np.max(np.abs(true_error_m(recording)[2000:])))
@@ -150,10 +160,12 @@ def test_at_the_gain_margin_the_value_seam_begins_to_ring(law):
 
 
 def answered(
-    profile, machine, law: str, relative_m: float, frequency_hz: float, late_s: float = 0.0, force_n: float = 0.2
+    profile, machine, law: str, relative_m: float, frequency_hz: float, observer=in_motion, late_s: float = 0.0
 ):
     """Put a sine on the micro's command: what the law asks for at that frequency, over the sine; its adaptive gain."""
+    force_n = 0.2
     simulation = simulated(profile, machine, law, relative_m=relative_m)
+    kept(simulation.controller.estimator, observer)
     simulation.devices["period_s"] = simulation.controller.estimator["period_s"]
     simulation.devices["latch_delay_s"] += late_s
     loop = Loop(simulation)
@@ -171,14 +183,15 @@ def answered(
     return complex(2.0 * np.mean(asked * turn) / force_n), float(np.mean(gains))
 
 
+@pytest.mark.parametrize("observer", [at_rest, in_motion])
 @pytest.mark.parametrize("law", ["dsmc", "pid"])
 @pytest.mark.parametrize(("place", "relative_m"), [("gap", 0.0), ("right", -170e-6), ("left", 170e-6)])
-def test_an_injected_sine_is_answered_as_computed(law, place, relative_m):
+def test_an_injected_sine_is_answered_as_computed(law, place, relative_m, observer):
     """Noise, rounding of torque words and all: within 3 % at and around the peak of the sensitivity."""
     profile, machine = load_profile("oled-printer"), load_machine("oled-printer")
     for frequency_hz in (20.0, 50.0, 90.0):
-        measured, gain = answered(profile, machine, law, relative_m, frequency_hz)
-        closed = linearise(profile, law, machine_body(machine), PLACES[place], gain).closed()
+        measured, gain = answered(profile, machine, law, relative_m, frequency_hz, observer)
+        closed = linearise(profile, law, machine_body(machine), PLACES[place], gain, observer).closed()
         computed = closed.response(np.array([frequency_hz]), "micro_command_n", "micro_force_asked_n")[0]
         assert abs(measured - computed) < 0.03 * abs(computed), (frequency_hz, measured, computed)
 

@@ -24,7 +24,7 @@ MOVE = trajectory.trapezoid(0.2, 0.2, dwell_s=1.0, lead_s=0.2).setpoints
 def slack(tmp_path, oled_profile):
     """A copy of the shipped profile whose law is slow; returns the file."""
     text = oled_profile.source_path.read_text()
-    changed = text.replace("micro_bandwidth_hz = 48.0", "micro_bandwidth_hz = 15.0  # by hand")
+    changed = text.replace("micro_bandwidth_hz = 50.0", "micro_bandwidth_hz = 15.0  # by hand")
     assert changed != text
     path = tmp_path / "slack.toml"
     path.write_text(changed)

@@ -91,9 +91,9 @@ class Budget:
     noises: Noises
     parts: tuple[Part, ...]
     bounds: Bounds
-    margins: Margins
+    margins: Margins  # where a force moves the end
     hold_m: float  # predicted
-    step_peak_m: float  # of the law, for STEP_N
+    step_peak_m: float  # of the law as it is at rest, for STEP_N
     levers: tuple[Lever, ...]
     is_force_noise_fitted: bool = False  # to the stretch itself: then its sum proves nothing
 
@@ -180,7 +180,7 @@ def _with_bounds(
     hold_m = shares.total_rms_m(profile, law, noises, body)
     of_body = body if body is not None else shares.believed_body(profile)
     loop = linearise(profile, law, of_body)
-    system = loop.closed()
+    system = shares.stable_loop(profile, law, of_body)
     force_n = np.full(round(0.5 / profile.cycle.period_s), STEP_N)
     force_n[0] = 0.0
     answer_m = shares.answer(system, {f"{loop.precise_axis}_force_n": force_n}, "end_position_m")

@@ -113,7 +113,8 @@ def bounds_table(budget: Budget) -> Table:
         f"sensor noise, {bounds.around.force_noise_n * 1e3:.3g} mN of force noise, steps of "
         f"{bounds.around.torque_step_n:.3g} N. The least hold is that of a loop that forces move far; what a loop "
         "gains against forces it pays in hold. As stiff: the best found over all weights that a force moves no more "
-        "than it moves the law.",
+        "than it moves the law. Hold and step of the law are those at rest; its Ms and delay margin are those of the "
+        "stiffer loop that it is where a force moves the end.",
     )
 
 

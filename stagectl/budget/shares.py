@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stagectl.adaptive_filter import at_rest
 from stagectl.budget.disturbances import (
     COGGING,
     CONTACT,
@@ -99,8 +100,8 @@ def spectra(
 
 
 def stable_loop(profile: "Profile", law: str, body: Body, adaptive_gain_ratio: float = 0.0) -> LinearSystem:
-    """Return the closed loop; RequestError where it is unstable, for then it has no spectrum."""
-    system = linearise(profile, law, body, adaptive_gain_ratio=adaptive_gain_ratio).closed()
+    """Return the closed loop as it is at rest; RequestError where it is unstable, for then it has no spectrum."""
+    system = linearise(profile, law, body, adaptive_gain_ratio=adaptive_gain_ratio, observer=at_rest).closed()
     if not system.is_stable():
         greatest = float(np.max(np.abs(system.poles())))
         raise RequestError(

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stagectl.adaptive_filter import at_rest, in_motion
 from stagectl.budget import shares
 from stagectl.budget.budget import STEP_N
 from stagectl.budget.disturbances import noises_of
@@ -39,6 +40,8 @@ CEILING = "gap, adapted"
 """With the adaptive gain at its ceiling."""
 MOVING = "in motion"
 """In the gap, at a speed at which dry friction is a force that damps nothing."""
+RESTING = "gap, at rest"
+"""With the observer as soft as it is there."""
 MASS_RATIO = 0.1
 
 _SLIDING_RATIO, _ETA_RATIO = (
@@ -189,6 +192,9 @@ def assessed(profile: "Profile", law: str, mode: Mode | None = None) -> Assessme
     if most:
         one = linearise(profile, law, body, GAP, most)
         loops.append(Loop(CEILING, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
+    if profile.control.rest_drift_ratio < 1.0:
+        one = linearise(profile, law, body, GAP, most, observer=at_rest)
+        loops.append(Loop(RESTING, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
     if mode is not None:
         loops += _loops_with(linearise(profile, law, body, GAP, most), mode)
     in_gap = linearise(profile, law, body)
@@ -197,10 +203,11 @@ def assessed(profile: "Profile", law: str, mode: Mode | None = None) -> Assessme
         hold_m = shares.total_rms_m(profile, law, noises_of(profile), body)
         peak_m = step_peak_m(in_gap)
     stable = all(
-        linearise(one, law, _heavier(believed_body(one), one, ratio)).closed().is_stable()
+        linearise(one, law, _heavier(believed_body(one), one, ratio), observer=observer).closed().is_stable()
         for one in (profile, moving)
         if one is not None
         for ratio in _OFF
+        for observer in (at_rest, in_motion)
     )
     return Assessment(tuple(loops), hold_m, peak_m, stable)
 

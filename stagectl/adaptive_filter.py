@@ -1,0 +1,149 @@
+"""The Kalman filter of the axis that carries the end: as soft as its noise asks at rest, stiff while a force moves it.
+
+    x' = v,  v' = (d + w) / m,  d' = white of density q,   y = x + n at every sample
+
+w is held for a period. Its gains follow from the covariance that it carries along (Kalman 1960; Anderson, Moore,
+Optimal Filtering, chapter 4). q lies between two densities of the profile, by how far the innovations are from noise:
+
+    q^2 = q_0^2 + u (q_1^2 - q_0^2),  u = min(1, |r / (3.5 sigma_r)|^3)
+
+r is their running mean over ten periods, sigma_r what noise makes of it at rest. (A level of process noise that is
+adjusted: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 11.2.) u is 0
+at rest and 1 where a force moves the end: decision 0027. Inside, positions count in the sensor's noise, times in
+periods h, forces in m n / h^2. Pure.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from stagectl.compiled import compiled
+from stagectl.signals import Record
+
+FIELDS = (
+    ("filter_unit", "f8", (3,)),  # of the gains: by it they are in SI
+    ("filter_walk", "f8"),  # (q_1)^2
+    ("filter_rest_walk", "f8"),  # (q_0)^2
+    ("filter_held", "f8"),  # w^2
+    ("filter_force_mean_m", "f8"),  # a mean of the innovations that is a force for sure: u = 1
+    ("filter_covariance", "f8", (6,)),  # xx, xv, xd, vv, vd, dd behind the last sample
+    ("filter_mean_m", "f8"),  # r
+    ("least_unrest_ratio", "f8"),  # u falls no lower
+    ("unrest_ratio", "f8"),  # u
+    ("precise_position_gain_ratio", "f8"),
+    ("precise_velocity_gain_per_s", "f8"),
+    ("precise_force_gain_n_per_m", "f8"),
+)
+"""What a record that has such a filter holds of it."""
+
+_MEAN_SAMPLES = 10.0
+_FORCE_DEVIATIONS = 3.5  # of a mean of noise: one in two thousand is beyond them
+
+_MOTION = np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # of (x, v, d) in a period
+_HELD = np.array([[0.25, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.0]])  # covariance that w brings in a period ...
+_WALK = np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])  # ... and the walk of d
+_SENSED = np.array([[1.0], [0.0], [0.0]])
+
+
+def init(
+    record: np.ndarray,
+    period_s: float,
+    mass_kg: float,
+    noise_m: float,
+    drift_n_per_sqrt_s: float,
+    rest_drift_ratio: float = 1.0,
+    force_noise_n: float = 0.0,
+) -> None:
+    """Write a filter into a record, shape (1,), settled at rest; q_0 is `rest_drift_ratio` times the drift, q_1."""
+    h = period_s
+    force_n = noise_m * mass_kg / h**2
+    walk = h * (drift_n_per_sqrt_s / force_n) ** 2
+    record["filter_unit"] = np.array([1.0, 1.0 / h, mass_kg / h**2])
+    record["filter_walk"] = walk
+    record["filter_rest_walk"] = rest_drift_ratio**2 * walk
+    record["filter_held"] = (force_noise_n / force_n) ** 2
+    at_rest(record)
+    innovation_m = noise_m / np.sqrt(1.0 - float(record["precise_position_gain_ratio"][0]))
+    record["filter_force_mean_m"] = _FORCE_DEVIATIONS * innovation_m / np.sqrt(2.0 * _MEAN_SAMPLES - 1.0)
+
+
+def at_rest(record: np.ndarray) -> None:
+    """Settle a filter as nothing but noise leaves it, u = 0."""
+    _settle(record, 0.0)
+
+
+def in_motion(record: np.ndarray) -> None:
+    """Settle a filter as a lasting force leaves it, and keep it there, u = 1: the stiffest that it gets."""
+    _settle(record, 1.0)
+
+
+def stiffening(samples_count: int) -> Callable[[np.ndarray], None]:
+    """Return what brings a filter to where it is so many samples after a force has struck at rest, u = 1."""
+
+    def struck(record: np.ndarray) -> None:
+        at_rest(record)
+        record["least_unrest_ratio"] = 1.0
+        for _ in range(samples_count):
+            step(record[0], 0.0)
+
+    return struck
+
+
+def _settle(record: np.ndarray, unrest_ratio: float) -> None:
+    one = record[0]
+    walk = one["filter_rest_walk"] + unrest_ratio * (one["filter_walk"] - one["filter_rest_walk"])
+    noise = one["filter_held"] * _HELD + walk * _WALK
+    ahead = solve_discrete_are(_MOTION.T, _SENSED, noise, np.eye(1))
+    gain = ahead[:, 0] / (ahead[0, 0] + 1.0)
+    record["filter_covariance"] = (ahead - np.outer(gain, ahead[0]))[np.triu_indices(3)]
+    record["filter_mean_m"] = 0.0
+    record["least_unrest_ratio"] = record["unrest_ratio"] = unrest_ratio
+    _write_gains(one, gain[0], gain[1], gain[2])
+
+
+def steady_gains(period_s: float, mass_kg: float, noise_m: float, drift_n_per_sqrt_s: float) -> np.ndarray:
+    """Return the gains on (position, velocity, unknown force) that a filter of one density has, shape (3,)."""
+    one = np.zeros(1, np.dtype([*FIELDS]))
+    init(one, period_s, mass_kg, noise_m, drift_n_per_sqrt_s)
+    names = ("precise_position_gain_ratio", "precise_velocity_gain_per_s", "precise_force_gain_n_per_m")
+    return np.array([float(one[name][0]) for name in names])
+
+
+@compiled
+def _write_gains(e: Record, to_position: float, to_velocity: float, to_force: float) -> None:
+    e.precise_position_gain_ratio = to_position * e.filter_unit[0]
+    e.precise_velocity_gain_per_s = to_velocity * e.filter_unit[1]
+    e.precise_force_gain_n_per_m = to_force * e.filter_unit[2]
+
+
+@compiled
+def step(e: Record, innovation_m: float) -> None:
+    """Take an innovation into the unrest, and bring covariance and gains to the sample that it came with."""
+    e.filter_mean_m += (innovation_m - e.filter_mean_m) / _MEAN_SAMPLES
+    share = abs(e.filter_mean_m / e.filter_force_mean_m)
+    e.unrest_ratio = max(share * share * share if share < 1.0 else 1.0, e.least_unrest_ratio)  # nan: 1
+    walk = e.filter_rest_walk + e.unrest_ratio * (e.filter_walk - e.filter_rest_walk)
+    held = e.filter_held
+    p = e.filter_covariance
+    xd = p[2] + p[4] + 0.5 * p[5]  # of _MOTION P _MOTION' ...
+    xv = p[1] + p[3] + 0.5 * p[4] + xd
+    xx = p[0] + p[1] + 0.5 * p[2] + xv - 0.5 * xd
+    vd = p[4] + p[5]
+    vv = p[3] + p[4] + vd
+    xx += 0.25 * held + walk / 20.0  # ... and what a period brings
+    xv += 0.5 * held + walk / 8.0
+    xd += walk / 6.0
+    vv += held + walk / 3.0
+    vd += walk / 2.0
+    dd = p[5] + walk
+    to_position = xx / (xx + 1.0)
+    to_velocity = xv / (xx + 1.0)
+    to_force = xd / (xx + 1.0)
+    p[0] = xx - to_position * xx
+    p[1] = xv - to_position * xv
+    p[2] = xd - to_position * xd
+    p[3] = vv - to_velocity * xv
+    p[4] = vd - to_velocity * xd
+    p[5] = dd - to_force * xd
+    _write_gains(e, to_position, to_velocity, to_force)
