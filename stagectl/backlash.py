@@ -120,7 +120,7 @@ FILTER_S = 0.015
 """Least time constant of the identification's filter at 1 kHz."""
 
 FORCE_NOISE_N = 5e-3
-"""Of the micro's motor, rms, held for a period."""
+"""Of the micro's motor, rms, held for a period, where the profile states none."""
 
 HOLD_RATIO = 7.0
 """How long the joint is pressed before a sample of its side counts, in that time constant."""
@@ -159,7 +159,7 @@ def believed_doubts(profile: "Profile") -> Doubts:
     return Doubts(micro.mass_sd_kg, ratio * micro.spring_n_per_m, ratio * micro.damping_n_s_per_m, force_n=force_n)
 
 
-def filter_time_s(profile: "Profile", force_noise_n: float = FORCE_NOISE_N) -> float:
+def filter_time_s(profile: "Profile") -> float:
     """Return the time constant of the identification's filter, s: the profile's own, else one for its sensors' noise.
 
     sqrt(m n / f) is where the force that position noise n feigns, m n / tau^2, is the motor's own noise f. In closed
@@ -170,15 +170,19 @@ def filter_time_s(profile: "Profile", force_noise_n: float = FORCE_NOISE_N) -> f
         return profile.backlash.filter_s
     if profile.micro is None:
         return FILTER_S
-    matched_s = math.sqrt(profile.micro.mass_kg * profile.interferometer.noise_m / force_noise_n)
+    matched_s = math.sqrt(profile.micro.mass_kg * profile.interferometer.noise_m / _force_noise_n(profile))
     return max(FILTER_S, _MATCHED_RATIO * matched_s)
+
+
+def _force_noise_n(profile: "Profile") -> float:
+    return (profile.micro.force_noise_n if profile.micro is not None else 0.0) or FORCE_NOISE_N
 
 
 def init(
     profile: "Profile",
     filter_s: float | None = None,
     doubts: Doubts | None = None,
-    force_noise_n: float = FORCE_NOISE_N,
+    force_noise_n: float | None = None,
     edge_drift_m_per_sqrt_s: float | None = None,
 ) -> np.ndarray:
     """Make BACKLASH: nothing known of edges and stiffness, whatever the profile believes.
@@ -201,7 +205,7 @@ def init(
     drift = profile.wear.edge_drift_m_per_sqrt_s if edge_drift_m_per_sqrt_s is None else edge_drift_m_per_sqrt_s
     b["edge_drift_m_per_sqrt_s"] = drift
     b["position_noise_m"] = profile.interferometer.noise_m
-    b["force_noise_n"] = force_noise_n
+    b["force_noise_n"] = _force_noise_n(profile) if force_noise_n is None else force_noise_n
     # Chain of three: X = expm(A h), input integrals by a Taylor series of the augmented matrix (first-order hold)
     augmented = np.zeros((5, 5))
     augmented[0, 0] = augmented[1, 1] = augmented[2, 2] = -w
