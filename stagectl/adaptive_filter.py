@@ -16,13 +16,13 @@ periods h, forces in m n / h^2. Pure.
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from stagectl.compiled import compiled
 from stagectl.signals import Record
 
 FIELDS = (
-    ("filter_unit", "f8", (3,)),  # of the gains: by it they are in SI
+    ("filter_per_s", "f8"),  # 1 / h
+    ("filter_n_per_m", "f8"),  # m / h^2
     ("filter_walk", "f8"),  # (q_1)^2
     ("filter_rest_walk", "f8"),  # (q_0)^2
     ("filter_held", "f8"),  # w^2
@@ -40,10 +40,7 @@ FIELDS = (
 _MEAN_SAMPLES = 10.0
 _FORCE_DEVIATIONS = 3.5  # of a mean of noise: one in two thousand is beyond them
 
-_MOTION = np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # of (x, v, d) in a period
-_HELD = np.array([[0.25, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.0]])  # covariance that w brings in a period ...
-_WALK = np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])  # ... and the walk of d
-_SENSED = np.array([[1.0], [0.0], [0.0]])
+_SETTLING_SAMPLES = 20_000  # well within them the covariance stays what it is
 
 
 def init(
@@ -59,10 +56,12 @@ def init(
     h = period_s
     force_n = noise_m * mass_kg / h**2
     walk = h * (drift_n_per_sqrt_s / force_n) ** 2
-    record["filter_unit"] = np.array([1.0, 1.0 / h, mass_kg / h**2])
+    record["filter_per_s"] = 1.0 / h
+    record["filter_n_per_m"] = mass_kg / h**2
     record["filter_walk"] = walk
     record["filter_rest_walk"] = rest_drift_ratio**2 * walk
     record["filter_held"] = (force_noise_n / force_n) ** 2
+    record["filter_force_mean_m"] = np.inf
     at_rest(record)
     innovation_m = noise_m / np.sqrt(1.0 - float(record["precise_position_gain_ratio"][0]))
     record["filter_force_mean_m"] = _FORCE_DEVIATIONS * innovation_m / np.sqrt(2.0 * _MEAN_SAMPLES - 1.0)
@@ -91,15 +90,16 @@ def stiffening(samples_count: int) -> Callable[[np.ndarray], None]:
 
 
 def _settle(record: np.ndarray, unrest_ratio: float) -> None:
-    one = record[0]
-    walk = one["filter_rest_walk"] + unrest_ratio * (one["filter_walk"] - one["filter_rest_walk"])
-    noise = one["filter_held"] * _HELD + walk * _WALK
-    ahead = solve_discrete_are(_MOTION.T, _SENSED, noise, np.eye(1))
-    gain = ahead[:, 0] / (ahead[0, 0] + 1.0)
-    record["filter_covariance"] = (ahead - np.outer(gain, ahead[0]))[np.triu_indices(3)]
+    record["least_unrest_ratio"] = unrest_ratio
     record["filter_mean_m"] = 0.0
-    record["least_unrest_ratio"] = record["unrest_ratio"] = unrest_ratio
-    _write_gains(one, gain[0], gain[1], gain[2])
+    record["filter_covariance"] = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+    _stay(record[0])
+
+
+@compiled
+def _stay(e: Record) -> None:
+    for _ in range(_SETTLING_SAMPLES):
+        step(e, 0.0)
 
 
 def steady_gains(period_s: float, mass_kg: float, noise_m: float, drift_n_per_sqrt_s: float) -> np.ndarray:
@@ -111,13 +111,6 @@ def steady_gains(period_s: float, mass_kg: float, noise_m: float, drift_n_per_sq
 
 
 @compiled
-def _write_gains(e: Record, to_position: float, to_velocity: float, to_force: float) -> None:
-    e.precise_position_gain_ratio = to_position * e.filter_unit[0]
-    e.precise_velocity_gain_per_s = to_velocity * e.filter_unit[1]
-    e.precise_force_gain_n_per_m = to_force * e.filter_unit[2]
-
-
-@compiled
 def step(e: Record, innovation_m: float) -> None:
     """Take an innovation into the unrest, and bring covariance and gains to the sample that it came with."""
     e.filter_mean_m += (innovation_m - e.filter_mean_m) / _MEAN_SAMPLES
@@ -126,12 +119,12 @@ def step(e: Record, innovation_m: float) -> None:
     walk = e.filter_rest_walk + e.unrest_ratio * (e.filter_walk - e.filter_rest_walk)
     held = e.filter_held
     p = e.filter_covariance
-    xd = p[2] + p[4] + 0.5 * p[5]  # of _MOTION P _MOTION' ...
+    xd = p[2] + p[4] + 0.5 * p[5]  # A P A' of A = (1 1 1/2, 0 1 1, 0 0 1) ...
     xv = p[1] + p[3] + 0.5 * p[4] + xd
     xx = p[0] + p[1] + 0.5 * p[2] + xv - 0.5 * xd
     vd = p[4] + p[5]
     vv = p[3] + p[4] + vd
-    xx += 0.25 * held + walk / 20.0  # ... and what a period brings
+    xx += 0.25 * held + walk / 20.0  # ... and what w and d's walk bring (van Loan, IEEE Trans. Aut. Control 23, 1978)
     xv += 0.5 * held + walk / 8.0
     xd += walk / 6.0
     vv += held + walk / 3.0
@@ -146,4 +139,6 @@ def step(e: Record, innovation_m: float) -> None:
     p[3] = vv - to_velocity * xv
     p[4] = vd - to_velocity * xd
     p[5] = dd - to_force * xd
-    _write_gains(e, to_position, to_velocity, to_force)
+    e.precise_position_gain_ratio = to_position
+    e.precise_velocity_gain_per_s = to_velocity * e.filter_per_s
+    e.precise_force_gain_n_per_m = to_force * e.filter_n_per_m

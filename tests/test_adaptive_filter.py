@@ -38,6 +38,7 @@ def by_scipy(drift_n_per_sqrt_s: float, force_noise_n: float) -> np.ndarray:
 @pytest.mark.parametrize(("state", "ratio"), [(one.at_rest, 0.12), (one.in_motion, 1.0)])
 def test_both_ends_are_kalman_filters_and_stay_where_they_are(state, ratio):
     record = made()
+    np.testing.assert_allclose(gains(record), by_scipy(0.12 * DRIFT, HELD_N), rtol=1e-4)  # it begins at rest
     state(record)
     np.testing.assert_allclose(gains(record), by_scipy(ratio * DRIFT, HELD_N), rtol=1e-4)
     for _ in range(50):
