@@ -126,6 +126,7 @@ class WireDecoder:
         self.macro_counts = math.nan
         self.end_counts = math.nan
         self.sequence = -1
+        self._earlier = (-1, math.nan, math.nan)  # the valid sample before the newest: number, counts
         self.cycle = -1
         self.reference_lost = 0
         self.reference_text = ""  # why it was lost, for people
@@ -197,6 +198,7 @@ class WireDecoder:
                 and (self._single or abs(reading.end_counts - self.end_counts) * self.end_m_per_count <= reach_m)
             ):
                 self._lose_reference(self._jump_text(reading, reach_m))
+        self._earlier = (self.sequence, self.macro_counts, self.end_counts)
         self.sequence = reading.sequence
         self.macro_counts = reading.macro_counts
         self.end_counts = reading.macro_counts if self._single else reading.end_counts
@@ -320,6 +322,7 @@ class WireDecoder:
         seen.t_ns = inbox.t_ns
         seen.samples_new = valid
         seen.sequence = self.sequence
+        seen.earlier_sequence = -1
         seen.latched_after_s = 0.0
         if self.sequence >= 0:
             seen.sample_t_ns, age_ns = sample_clock.sample_at(self.clock, self.sequence, inbox.t_ns)
@@ -331,6 +334,10 @@ class WireDecoder:
             self._follow_air()
             seen.macro_position_m = (self.macro_counts - self.macro_zero_counts) * self.macro_m_per_count
             seen.end_position_m = (self.end_counts - self.end_zero_counts) * self.end_m_per_count
+            if valid > 1:
+                seen.earlier_sequence, macro_counts, end_counts = self._earlier
+                seen.macro_earlier_m = (macro_counts - self.macro_zero_counts) * self.macro_m_per_count
+                seen.end_earlier_m = (end_counts - self.end_zero_counts) * self.end_m_per_count
             if valid and self.encoder_trusted and seen.tpdos_new & 1:
                 self._look_for_stuck_counts(seen.macro_encoder_m)
             if valid and self.sequence == self.cycle:  # behind a late line the drive's position is of a later SYNC

@@ -97,6 +97,7 @@ def run(setpoints, noise_m, late, instants_s, devices, state, parameters, machin
         macro_m = np.floor(macro_m / macro_step_m + 0.5) * macro_step_m * d.reading_ratio - d.macro_zero_m
         end_m = np.floor(end_m / end_step_m + 0.5) * end_step_m * d.reading_ratio - d.end_zero_m
         m.samples_new = 0
+        m.earlier_sequence = -1
         if d.late_sample >= 0.0:  # the line of the sample before is here by now
             m.sequence = int(d.late_sample)
             m.sample_t_ns = int(d.late_t_s * 1e9)
@@ -113,6 +114,10 @@ def run(setpoints, noise_m, late, instants_s, devices, state, parameters, machin
             m.sequence = m.cycle
             m.sample_t_ns = int(t_s * 1e9)
             m.samples_new += 1
+            if m.samples_new > 1:
+                m.earlier_sequence = m.cycle - 1
+                m.macro_earlier_m = m.macro_position_m
+                m.end_earlier_m = m.end_position_m
             m.macro_position_m = macro_m
             m.end_position_m = end_m
         setpoint[0] = setpoints[k]

@@ -48,6 +48,8 @@ ESTIMATOR = np.dtype(
         ("jerk_change_before_m_per_s3", "f8"),
         ("macro_seen_m", "f8"),  # this cycle's positions: the sample, or its prediction where the line is late
         ("end_seen_m", "f8"),
+        ("identification_waits", "f8"),  # 1 while the last sample, predicted so far, may come late
+        ("waiting_force_n", "f8"),  # mean on the micro over the period before it
         ("macro_innovation_m", "f8"),
         ("end_innovation_m", "f8"),
         *adaptive_filter.FIELDS,  # of the axis that carries the end
@@ -134,6 +136,7 @@ def start(e: Record, s: Record, m: Record) -> None:
     s.micro_disturbance_n = 0.0
     s.memory[:] = 0.0
     e.filter_mean_m = 0.0
+    e.identification_waits = 0.0
     e.cycle = m.cycle
     e.started = 1.0
 

@@ -116,6 +116,8 @@ def _apply(decoder: WireDecoder, tracker: Tracker, event: Mapping[str, Any]) -> 
     shifts = decoder.set_zeros(float(event["macro_zero_counts"]), float(event["end_zero_counts"]))
     tracker.measurement["macro_position_m"] += shifts[0]
     tracker.measurement["end_position_m"] += shifts[1]
+    tracker.measurement["macro_earlier_m"] += shifts[0]
+    tracker.measurement["end_earlier_m"] += shifts[1]
     tracker.update(belief, *shifts)
 
 

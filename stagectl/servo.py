@@ -342,6 +342,8 @@ class Servo:
             seen = self._seen
             seen.macro_position_m += shifts[0]
             seen.end_position_m += shifts[1]
+            seen.macro_earlier_m += shifts[0]
+            seen.end_earlier_m += shifts[1]
             self.tracker.update(belief_of(self._request), *shifts)
             self._update_number = number
             self._homing_id = asked.homing_id

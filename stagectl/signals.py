@@ -39,6 +39,9 @@ MEASUREMENT = np.dtype(
         ("reference_lost", "i8"),  # 1 after a beam loss, a restart or an impossible jump; latched until homing
         ("macro_position_m", "f8"),  # laser, in the run's own zero
         ("end_position_m", "f8"),
+        ("earlier_sequence", "i8"),  # of the valid sample before the newest where both are new, else -1
+        ("macro_earlier_m", "f8"),
+        ("end_earlier_m", "f8"),
         ("macro_encoder_m", "f8"),  # drive's own encoder, in the drive's zero
         ("micro_encoder_m", "f8"),
         ("macro_reported_force_n", "f8"),  # torque actual value x rated force

@@ -48,9 +48,14 @@ def estimate(m, e, model, ahead, b, q, p):
         # Left out, lines that always came late left the loop open, and the forces grew to their limits in 100 ms.
         due = int(m.sequence - x.cycle) if m.samples_new > 0 else -1
         x.predicted_samples = periods - due if 0 <= due <= periods else x.predicted_samples + periods
-        if due == 0:
+        if due == 0 or m.samples_new > 1 and m.earlier_sequence == x.cycle:
             macro_error_m, end_error_m = plant_module.sense(model, q, p, 0.0)
-            estimator.correct(x, s, q[0], m.macro_position_m - macro_error_m, m.end_position_m - end_error_m)
+            x.macro_seen_m = (m.macro_position_m if due == 0 else m.macro_earlier_m) - macro_error_m
+            x.end_seen_m = (m.end_position_m if due == 0 else m.end_earlier_m) - end_error_m
+            estimator.correct(x, s, q[0], x.macro_seen_m, x.end_seen_m)
+        if x.identification_waits != 0.0:  # for the sample above, or for one that stays away: its prediction then
+            x.identification_waits = 0.0
+            backlash.step(b[0], x.cycle, x.macro_seen_m, x.end_seen_m, x.waiting_force_n, q[0])
         for k in range(periods):
             t_s = s.t_s
             plant_module.advance(model, q, p, t_s + x.actuation_delay_s, x.longest_substep_s,
@@ -68,7 +73,6 @@ def estimate(m, e, model, ahead, b, q, p):
                 x.macro_seen_m = s.macro_position_m
                 x.end_seen_m = s.end_position_m
             if q[0].has_micro != 0.0 and periods + x.predicted_samples <= x.bridged_samples_max:
-                # A line that comes late is one in twenty: its place is filled by what was predicted (a few nm off).
                 # Stuff bits move the end of SYNC with the word's own bits: a microsecond is 2 mN, and no noise.
                 latched_s = m.latched_after_s if k == 0 and m.latched_after_s > 0.0 else x.actuation_delay_s
                 mean_n = backlash.motor_mean_force(b[0], q[0], x.micro_word_before, x.micro_word,
@@ -82,7 +86,13 @@ def estimate(m, e, model, ahead, b, q, p):
                                              q[0].micro_mass_kg, relative_m, rate, s.micro_current_a, mean_n, mean_n,
                                              s.t_s, 0.0, s.memory, p)
                 mean_n += forces.joint(relative_m, rate, s.t_s, 0.0, s.memory, p)
-                backlash.step(b[0], x.cycle + k + 1, x.macro_seen_m, x.end_seen_m, mean_n, q[0])
+                # One line in twelve is late. Filled by what was predicted at a blow, its place moved edges by half of
+                # their standard deviation and more: 87 % of the 95 % intervals held.
+                if k == periods - 1 and k != due - 1:
+                    x.identification_waits = 1.0
+                    x.waiting_force_n = mean_n
+                else:
+                    backlash.step(b[0], x.cycle + k + 1, x.macro_seen_m, x.end_seen_m, mean_n, q[0])
             x.macro_word_before = x.macro_word
             x.micro_word_before = x.micro_word
         x.cycle = m.cycle

@@ -101,6 +101,7 @@ class Tracker:
                 setpoint["relative_position_m"] += end_shift_m - macro_shift_m + centre_shift_m
         one.guard["macro_position_m"] += macro_shift_m
         one.backlash[...] = backlash.init(self._profile)
+        one.estimator["identification_waits"] = 0.0
 
     def new_belief(self) -> np.ndarray:
         """Return what the profile believes, for a request that changes nothing."""

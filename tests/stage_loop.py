@@ -71,10 +71,15 @@ class Loop:
         m["lease_left_ns"] = 1_000_000_000
         m["latched_after_s"] = d["latched_after_s"]
         m["samples_new"] = 0
+        m["earlier_sequence"] = -1
         this = (int(d["sample"]), int(t_s * 1e9), *seen)
         fresh = fresh and not silent
         for line in (self._late, this if fresh else None):
             if line is not None:
+                if m["samples_new"][0]:
+                    m["earlier_sequence"], m["macro_earlier_m"], m["end_earlier_m"] = (
+                        m["sequence"], m["macro_position_m"], m["end_position_m"]
+                    )  # fmt: skip
                 m["sequence"], m["sample_t_ns"], m["macro_position_m"], m["end_position_m"] = line
                 m["samples_new"] += 1
         self._late = None if fresh or silent else this

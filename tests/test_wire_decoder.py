@@ -155,3 +155,21 @@ def test_when_the_last_command_was_latched_is_told_from_its_own_sample():
         inbox.sync_t_ns = sample_t_ns + 600_000 + 50 * (number % 90)
     assert told[0] == 0.0
     assert np.max(np.abs(np.array(told[2000:]) - meant[2000:])) < 0.2e-6
+
+
+def test_a_line_that_comes_with_the_next_is_told_too():
+    """Counts of the uMD2 move between them; alone, a sample has none before it."""
+    decoder, seen = WireDecoder(load_profile("oled-printer-umd2"), {}), fields(new(MEASUREMENT))
+    told = []
+    for numbers in ((0,), (1,), (), (2, 3), (4,), (5, 6, 7)):
+        inbox = Inbox(t_ns=10**9 + (numbers[-1] if numbers else 2) * MS + MS // 2)
+        for number in numbers:
+            inbox.add_sensor_bytes(LINE % (100 * number, number, 0, 0, 50 * number), inbox.t_ns - 350_000)
+        assert decoder.decode(inbox, seen) == ""
+        earlier_m = seen.macro_position_m - seen.macro_earlier_m, seen.end_position_m - seen.end_earlier_m
+        told.append((seen.samples_new, seen.earlier_sequence, earlier_m))
+    assert [one[:2] for one in told[2:]] == [(0, -1), (2, 2), (1, -1), (3, 6)]  # the first waits for a second
+    for place in (3, 5):
+        apart_m = told[place][2]
+        assert apart_m[0] == pytest.approx(100 * decoder.macro_m_per_count, rel=1e-9)
+        assert abs(apart_m[1]) == pytest.approx(50 * decoder.end_m_per_count, rel=1e-9)
