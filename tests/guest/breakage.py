@@ -1,0 +1,180 @@
+"""Hurt in every way, and recovered: what docs/operations.md says of each fault."""
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stage_pc import PORT, UNIT, check, report, rig, servo_pid, shell, stage, unit, until
+
+# The interface goes down at STRUCK_M on the way to FAR_M; every later fault strikes while the macro drive looks for its
+# index, from there back to 0: so no fault needs a whole homing before it.
+FAR_M, STRUCK_M = 0.4, 0.2
+AT_REST_M_PER_S = 2e-4
+# Heartbeat time of the drives, the ramp from the speed limit, and what the emulation adds.
+DRIVES_STOP_S = 6.0
+SUPERVISOR_SILENCE_S = 2.0
+REST_PATIENCE_S = 60.0
+STEP_S = 2.0
+MEMORY_SHARE = 0.7  # of what servo and supervisor hold: one of them has to go
+
+
+@contextmanager
+def moving() -> Iterator[None]:
+    """A stage under way to a far target, well off its index; the lease is held."""
+    with stage.lease():
+        stage.do("arm" if stage.status()["homed"] else "home")
+        stage.begin("move", target_m=FAR_M)
+        until("a stage under way", lambda: rig.end_m() > STRUCK_M)
+        yield
+
+
+@contextmanager
+def homing() -> Iterator[None]:
+    """A stage whose macro drive looks for its index by itself; the lease is held."""
+    with stage.lease():
+        stage.begin("home")
+        until("the drive moves", lambda: rig.speed_m_per_s() > 0.01)
+        yield
+
+
+def stops(what: str, began_s: float) -> None:
+    """Wait until the plant rests and no drive follows commands any more; a check of how long that took."""
+
+    def rests() -> bool:
+        state = rig.state()
+        slow = abs(state["plant"]["macro_velocity_m_per_s"]) < AT_REST_M_PER_S
+        return slow and "OPERATION_ENABLED" not in state["drives"].values()
+
+    until(f"{what}: rest without power", rests, REST_PATIENCE_S)
+    took_s = time.monotonic() - began_s
+    check(f"{what}: the drives stop the stage", took_s < DRIVES_STOP_S, f"{took_s:.1f} s, {rig.state()['drives']}")
+
+
+def faulted(what: str, *kinds: str) -> None:
+    """Check that a fault says what it was."""
+    fault = stage.await_state("fault")["fault"]
+    check(f"{what}: a fault says so", fault["kind"] in kinds, f"{fault['kind']}: {fault['values'][:150]}")
+
+
+def recovers(what: str) -> None:
+    """Acknowledge what there is, and come to idle without a restart by hand."""
+    if stage.await_state("idle", "fault", "off")["state"] == "fault":
+        fault = stage.acknowledge()
+        report.say(f"        fault {fault['kind']}: {fault['what']}: {fault['values'][:150]}; {fault['remedy']}")
+    stage.await_state("idle")
+    check(f"{what}: idle again", unit("ActiveState") == "active", f"{unit('NRestarts')} restarts")
+    shell("systemctl", "reset-failed", UNIT)
+
+
+def await_restart(what: str, before: int) -> None:
+    """Wait for systemd's restart, and check it."""
+    until(f"{what}: a restart", lambda: int(unit("NRestarts")) > before and unit("ActiveState") == "active")
+    check(f"{what}: systemd brings the service back", True)
+
+
+def clock_stepped() -> None:
+    """Somebody sets the clock, an hour on and back: nothing happens."""
+    with stage.lease():
+        stage.do("arm")
+        before = stage.status()["health"]
+        for step in ("+1 hour", "-1 hour"):
+            shell("date", "--set", step)
+            time.sleep(STEP_S)
+        after = stage.status()
+        went_on = after["health"]["cycles_count"] - before["cycles_count"] > STEP_S * before["rate_hz"]
+        check("clock stepped: it holds the stage", went_on and after["state"] == "armed", after["fault"])
+
+
+def can_down() -> None:
+    """The CAN interface is taken down under a moving stage, and comes up again."""
+    with moving():
+        began_s = time.monotonic()
+        shell("ip", "link", "set", "vcan0", "down")
+        stops("vcan0 down", began_s)
+    faulted("vcan0 down", "LINK_LOST", "LINK_SILENT", "LinkError")
+    shell("ip", "link", "set", "vcan0", "up")
+    recovers("vcan0 up")
+
+
+def serial_unplugged() -> None:
+    """The interferometer's adapter is pulled under a moving stage, and plugged in again."""
+    serials = Path("/sys/bus/usb/devices").glob("*/serial")
+    adapter = next(path.parent for path in serials if path.read_text().strip() in PORT)
+    with homing():
+        began_s = time.monotonic()
+        (adapter / "authorized").write_text("0")
+        stops("unplugged", began_s)
+    faulted("unplugged", "LINK_LOST", "SENSOR_AGE", "LinkError")
+    check("unplugged: homing is void", not stage.status()["homed"])
+    stage.acknowledge()
+    waits = until("unplugged: it waits", lambda: stage.status()["waiting_for"])
+    check("unplugged: it waits for the port", "LASER001" in waits, waits)
+    (adapter / "authorized").write_text("1")
+    until(PORT, lambda: os.path.exists(PORT), 30.0)
+    recovers("plugged in")
+
+
+def servo_killed() -> None:
+    """The servo is killed under a moving stage."""
+    with homing():
+        began_s = time.monotonic()
+        os.kill(servo_pid(), signal.SIGKILL)
+        stops("servo killed", began_s)
+    faulted("servo killed", "LinkError")
+    recovers("servo killed")
+
+
+def supervisor_killed() -> None:
+    """The supervisor is killed under a moving stage: the servo stops it, systemd brings the service back."""
+    before = int(unit("NRestarts"))
+    with homing():
+        began_s = time.monotonic()
+        os.kill(int(unit("MainPID")), signal.SIGKILL)
+        stops("supervisor killed", began_s + SUPERVISOR_SILENCE_S)
+    await_restart("supervisor killed", before)
+    recovers("supervisor killed")
+
+
+def supervisor_hung() -> None:
+    """The supervisor hangs while the drive homes: the stage stops, the watchdog ends the service, and it restarts."""
+    before = int(unit("NRestarts"))
+    with homing():
+        began_s = time.monotonic()
+        os.kill(int(unit("MainPID")), signal.SIGSTOP)
+        stops("supervisor hangs", began_s + SUPERVISOR_SILENCE_S)
+    await_restart("supervisor hangs", before)
+    said = shell("journalctl", "-u", UNIT, "--no-pager", "-o", "cat")
+    check("supervisor hangs: it was the watchdog", "Watchdog timeout" in said)
+    recovers("supervisor hangs")
+
+
+def out_of_memory() -> None:
+    """The kernel kills for want of memory while the drive homes: the stage stops, and it goes on without a hand."""
+    before, supervisor = int(unit("NRestarts")), int(unit("MainPID"))
+    group = Path(f"/sys/fs/cgroup{unit('ControlGroup')}")
+    with homing():
+        facts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        began_s = time.monotonic()
+        (group / "memory.max").write_text(str(round(MEMORY_SHARE * int(facts["anon"]))))
+        stops("out of memory", began_s + SUPERVISOR_SILENCE_S)
+        (group / "memory.max").write_text("max")
+    killed = shell("journalctl", "-k", "--no-pager", "-o", "cat").count("Memory cgroup out of memory: Killed process")
+    check("out of memory: the kernel killed", killed > 0, f"{killed} processes")
+    if supervisor != int(unit("MainPID")):
+        await_restart("out of memory", before)
+    recovers("out of memory")
+
+
+def recovered() -> None:
+    """After all that, the stage homes, moves and records as before."""
+    with stage.lease():
+        stage.do("home")
+        stage.do("move", target_m=0.01)
+    stage.await_state("idle")
+    check("after all that it homes and moves", True)
+    rows = [(run["name"], run["state"], run["rows_count"]) for run in stage.ask("GET", "/v1/runs")]
+    unreadable = [run for run in rows if run[1] not in ("complete", "recovered", "open", "crashed", "running")]
+    check("every run can be read", len(rows) > 5 and not unreadable, unreadable or f"{len(rows)} runs")

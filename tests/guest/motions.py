@@ -1,0 +1,40 @@
+"""Moved through the API, and measured on the rig's truth."""
+
+from stage_pc import check, report, rig, shell, stage
+
+WIDTH_M = 27.9e-6 + 171.3e-6  # machine.toml
+NEAR_M = 1e-4
+JOG_M = 0.005
+SCAN = {
+    "start_m": 0.0,
+    "repeat_count": 2,
+    "segments": [
+        {"target_m": 0.005, "pass_velocity_m_per_s": 0.02},
+        {"target_m": 0.02, "velocity_m_per_s": 0.02, "dwell_s": 0.2},
+        {"target_m": -0.01},
+    ],
+}
+IDENTIFY_S = 30.0
+
+
+def moved() -> None:
+    """Home, jog, identify, scan."""
+    with stage.lease():
+        stage.do("home")
+        began_m = rig.end_m()
+        stage.do("jog", distance_m=JOG_M)
+        went_m = rig.end_m() - began_m
+        check(f"a jog of {JOG_M * 1e3:g} mm", abs(went_m - JOG_M) < NEAR_M, f"{went_m * 1e3:.3f} mm")
+        found = stage.do("identify", duration_s=IDENTIFY_S)["backlash"]
+        off_m, sd_m = found["width_m"] - WIDTH_M, found["width_sd_m"]
+        text = f"{found['width_m'] * 1e6:.2f} um, {WIDTH_M * 1e6:.2f} true, sd {sd_m * 1e6:.2f}"
+        check("its 95 % interval holds the true width", abs(off_m) <= 1.96 * sd_m, text)
+        began_m, before_m = rig.end_m(), stage.status()["positions"]["end_position_m"]
+        stage.do("scan", **SCAN)
+        went_m, wanted_m = rig.end_m() - began_m, SCAN["segments"][-1]["target_m"] - before_m
+        check("a scan ends where it should", abs(went_m - wanted_m) < NEAR_M, f"{went_m * 1e3:.3f} mm")
+        health = stage.status()["health"]
+        report.say(f"        cycles {health['cycles_count']}, missed {health['missed_cycles_count']}")
+    state = stage.await_state("idle")["state"]
+    check("the lease given back, the stage has no power", state == "idle", rig.state()["drives"])
+    check("the command says the same", "idle" in shell("/usr/local/bin/stagectl", "status"))
