@@ -71,7 +71,11 @@ def recovers(what: str) -> None:
 
 def await_restart(what: str, before: int) -> None:
     """Wait for systemd's restart, and check it."""
-    until(f"{what}: a restart", lambda: int(unit("NRestarts")) > before and unit("ActiveState") == "active")
+
+    def restarted() -> bool:
+        return int(unit("NRestarts")) > before and unit("ActiveState") == "active"
+
+    until(f"{what}: a restart", restarted, period_s=3.0)
     check(f"{what}: systemd brings the service back", True)
 
 

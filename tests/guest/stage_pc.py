@@ -64,8 +64,8 @@ def shell(*command: str, **options: Any) -> str:
     return done.stdout
 
 
-def until(what: str, holds: Callable[[], Any], patience_s: float = PATIENCE_S) -> Any:
-    """Wait until something is true and return it; Failed after a time."""
+def until(what: str, holds: Callable[[], Any], patience_s: float = PATIENCE_S, period_s: float = 0.3) -> Any:
+    """Wait until something is true and return it; Failed after a time. Asking costs the guest's CPU: not too often."""
     give_up_s = time.monotonic() + patience_s
     seen = None
     while time.monotonic() < give_up_s:
@@ -76,7 +76,7 @@ def until(what: str, holds: Callable[[], Any], patience_s: float = PATIENCE_S) -
         else:
             if seen:
                 return seen
-        time.sleep(0.3)
+        time.sleep(period_s)
     raise Failed(f"{what}: not within {patience_s:g} s; at last {seen}")
 
 
@@ -144,7 +144,7 @@ class Stage:
             return seen if seen["state"] in wanted else None
 
         try:
-            return until(f"state {' or '.join(wanted)}", reached, patience_s)
+            return until(f"state {' or '.join(wanted)}", reached, patience_s, 1.0)
         except Failed as error:
             shown = {name: seen.get(name) for name in ("state", "waiting_for", "fault", "remarks")}
             raise Failed(f"{error}; the status says {shown}") from error
