@@ -19,7 +19,7 @@ DRIVES_STOP_S = 5.0
 SERVO_STOPS_S = DRIVES_STOP_S + 2.0
 REST_PATIENCE_S = 60.0
 STEP_S = 2.0
-MEMORY_SHARE = 0.7  # of what servo and supervisor hold: one of them has to go
+MEMORY_SHARE = 0.7  # of what the servo has locked: enough for the supervisor alone
 
 
 @contextmanager
@@ -163,7 +163,7 @@ def out_of_memory() -> None:
     with homing():
         facts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
         began_s = time.monotonic()
-        (group / "memory.max").write_text(str(round(MEMORY_SHARE * int(facts["anon"]))))
+        (group / "memory.max").write_text(str(round(MEMORY_SHARE * int(facts["unevictable"]))))
         stops("out of memory", began_s, SERVO_STOPS_S)
         (group / "memory.max").write_text("max")
     killed = shell("journalctl", "-k", "--no-pager", "-o", "cat").count("Memory cgroup out of memory: Killed process")

@@ -5,7 +5,7 @@
 set -euo pipefail
 HERE=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 FOLDER=${XDG_CACHE_HOME:-$HOME/.cache}/stagectl-guest
-LIMIT_S=${GUEST_LIMIT_S:-1200}
+LIMIT_S=${GUEST_LIMIT_S:-1800}
 
 [[ $EUID -eq 0 ]] || {
   echo "guest-test makes a disk image and has to be root: sudo make guest-test" >&2
