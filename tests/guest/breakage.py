@@ -11,7 +11,7 @@ from stage_pc import PORT, UNIT, check, report, rig, servo_pid, shell, stage, un
 
 # The interface goes down at STRUCK_M on the way to FAR_M; every later fault strikes while the macro drive looks for its
 # index, from there back to 0: so no fault needs a whole homing before it.
-FAR_M, STRUCK_M = 0.4, 0.2
+FAR_M, STRUCK_M = 0.42, 0.3
 AT_REST_M_PER_S = 2e-4
 # Heartbeat time of the drives, the ramp from the speed limit, and how seldom it is looked at; a servo that lost its
 # supervisor waits for it first.
