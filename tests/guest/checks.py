@@ -1,4 +1,4 @@
-"""What a stage PC has to show: installed, upgraded, opened, read back, removed; or moved, hurt in every way, removed.
+"""What a stage PC has to show: installed, upgraded, opened, read back, removed; or hurt in every way, moved, removed.
 
 Runs as root in the guest. One line a check; exit code 1 where one failed. The file `machine` beside this one says which
 of the two; names of groups in the file `only` (from $GUEST_CHECKS) leave out the others.
@@ -12,7 +12,7 @@ from breakage import (
     can_down,
     clock_stepped,
     out_of_memory,
-    recovered,
+    recorded,
     serial_unplugged,
     servo_killed,
     supervisor_hung,
@@ -30,8 +30,8 @@ GROUPS: dict[str, tuple[tuple[Group, ...], tuple[Group, ...]]] = {
     "motion": (
         (ready, opened),
         (
-            moved, clock_stepped, can_down, serial_unplugged, servo_killed, supervisor_killed, supervisor_hung,
-            out_of_memory, recovered,
+            serial_unplugged, servo_killed, supervisor_killed, supervisor_hung, out_of_memory,
+            moved, clock_stepped, can_down, recorded,
         ),
     ),
 }  # fmt: skip

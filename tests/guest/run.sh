@@ -23,10 +23,10 @@ fi
 "$HERE/image.sh" "$FOLDER"
 
 # A machine's clock: its processor's where it is virtualised, the host's where it is emulated; there `motion` has one that
-# goes on with the instructions it has carried out, four nanoseconds each. So its servo keeps its 100 Hz on a host of any
+# goes on with the instructions it has carried out, two nanoseconds each. So its servo keeps its 100 Hz on a host of any
 # speed and load, and the test takes longer. That needs a machine of one CPU; `installation` shows what two are for.
 two_cpus=(-accel "tcg,thread=multi" -smp 2)
-own_clock=(-accel "tcg,thread=single" -icount "shift=2,sleep=on" -smp 1)
+own_clock=(-accel "tcg,thread=single" -icount "shift=1,sleep=on" -smp 1)
 if [[ -w /dev/kvm ]] && grep -qsE '^flags.* (svm|vmx)( |$)' /proc/cpuinfo; then
   two_cpus=(-accel kvm -smp 2)
   own_clock=("${two_cpus[@]}")
