@@ -12,7 +12,6 @@ from breakage import (
     can_down,
     clock_stepped,
     out_of_memory,
-    recorded,
     serial_unplugged,
     servo_killed,
     supervisor_hung,
@@ -31,7 +30,7 @@ GROUPS: dict[str, tuple[tuple[Group, ...], tuple[Group, ...]]] = {
         (ready, opened),
         (
             serial_unplugged, servo_killed, supervisor_killed, supervisor_hung, out_of_memory,
-            moved, clock_stepped, can_down, recorded,
+            moved, clock_stepped, can_down,
         ),
     ),
 }  # fmt: skip
