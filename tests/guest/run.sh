@@ -65,11 +65,10 @@ boot() { # NAME OPTIONS
 # Also where this is interrupted.
 trap 'cat "$FOLDER"/{installation,motion}/pid 2>/dev/null | xargs -r kill 2>/dev/null || true' EXIT
 # Side by side: neither keeps two CPUs of the host busy all the time.
-boot installation "${two_cpus[@]}" &
-installation=$!
-boot motion "${own_clock[@]}" &
-motion=$!
-code=0
-wait $installation || code=$?
-wait $motion || code=$?
+code=0 running=()
+for machine in ${GUEST_MACHINES:-installation motion}; do
+  if [[ $machine == installation ]]; then boot installation "${two_cpus[@]}" & else boot motion "${own_clock[@]}" & fi
+  running+=($!)
+done
+for machine in "${running[@]}"; do wait "$machine" || code=$?; done
 exit $code
