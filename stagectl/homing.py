@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from drivers import cia402
 from stagectl import trajectory as trajectories
 from stagectl.backlash import HOLD_RATIO, filter_time_s
@@ -24,9 +26,8 @@ from stagectl.touch_sweep import (
 
 _INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
 _TOUCH_TRIES = 4
-_SETTLE_S = 0.3  # the micro on its spring, which nothing holds
-_STANDSTILL_WINDOW_S = 0.1
-_STANDSTILL_M_PER_S = 1e-4  # 0.1 um in a cycle of 1 ms
+_STANDSTILL_WINDOW_S = 0.2
+_STANDSTILL_M = 20e-6  # in that time: 0.1 um in a cycle of 1 ms
 _STANDSTILL_TIMEOUT_S = 3.0
 _JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
 
@@ -63,33 +64,34 @@ class Homing(StreamMotion):
         status = self.status()
         macro_scale, end_scale = self._scales()
         macro_zero = float(status["macro_counts"]) - float(status["macro_encoder_m"]) / macro_scale
-        # Without power the micro's spring stands at its middle: end = macro there, until the edges say better.
+        # At rest without power the micro's spring stands at its middle: end = macro, until the edges say better.
         end_zero = float(status["end_counts"]) - float(status["macro_encoder_m"]) / end_scale
         self._homing_id += 1
         self._publish_update(macro_zero, end_zero)
         return macro_zero, end_zero
 
     def _await_standstill(self) -> Stop:
-        """Wait until the laser sees the macro stand: it and the encoder tell of instants a cycle apart.
+        """Wait until the lasers see the stage stand: they and the encoder tell of instants a cycle apart.
 
-        Returns what ended the hold, NONE where it stands. DriveError where it moves on.
+        The macro must, held by its drive; the micro swings on its spring, and is waited for as long as that pays.
+        Returns what ended the hold, NONE where it stands. DriveError where the macro moves on.
         """
-        self.pump(_SETTLE_S)
-        scale, _ = self._scales()
+        window_rows = round(_STANDSTILL_WINDOW_S * self.profile.cycle.rate_hz)
         give_up_t_ns = self.link.now_t_ns() + round(_STANDSTILL_TIMEOUT_S * 1e9)
         status = self._await_sensor()
         while status["phase"] != Phase.STOPPED:
-            before, before_t_ns = float(status["macro_counts"]), int(status["t_ns"])
             self.pump(_STANDSTILL_WINDOW_S)
             status = self._await_sensor()
-            passed_s = (int(status["t_ns"]) - before_t_ns) * 1e-9
-            speed_m_per_s = abs(float(status["macro_counts"]) - before) * scale / max(passed_s, _STANDSTILL_WINDOW_S)
-            if speed_m_per_s <= _STANDSTILL_M_PER_S:
+            rows = self.link.rows.read_last(window_rows)
+            # From the least to the greatest: where a swing turns round, it is as far after a while as before.
+            macro_m, end_m = (float(np.ptp(rows[f"{axis}_position_m"])) for axis in ("macro", "end"))
+            over = self.link.now_t_ns() > give_up_t_ns
+            if macro_m <= _STANDSTILL_M and (over or end_m <= _STANDSTILL_M):
                 return Stop.NONE
-            if self.link.now_t_ns() > give_up_t_ns:
+            if over:
                 raise DriveError(
-                    f"homing: the macro still moves at {speed_m_per_s * 1e3:.2g} mm/s {_STANDSTILL_TIMEOUT_S:g} s "
-                    f"after its drive found the index, limit {_STANDSTILL_M_PER_S * 1e3:g} mm/s; check "
+                    f"homing: the macro still moves by {macro_m * 1e6:.0f} um in {_STANDSTILL_WINDOW_S:g} s, limit "
+                    f"{_STANDSTILL_M * 1e6:g} um, {_STANDSTILL_TIMEOUT_S:g} s after its drive found the index; check "
                     "that the drive's position loop holds there, then home again"
                 )
         return Stop(int(status["stop"]))

@@ -5,7 +5,9 @@ import pytest
 
 from drivers import cia402
 from sim_backend.faults import Fault
+from sim_backend.machine import load_machine
 from stagectl.backend import BatchBackend
+from stagectl.profile import load_profile
 from stagectl.record import read_run
 from stagectl.requests import Phase
 from stagectl.signals import Stop
@@ -37,6 +39,27 @@ def test_zeros_are_those_of_a_stage_that_stands(tmp_path, single_profile, single
     assert np.abs(after["macro_position_m"] - true_m).max() < 0.2e-6
     assert after["run_phase"][0] == Phase.HOMED_DRIVE
     assert cia402.state_of(int(after["macro_statusword"][0])) is cia402.State.OPERATION_ENABLED
+
+
+def test_the_micro_has_come_to_rest_on_its_spring(tmp_path):
+    """It swung by 0.9 mm still when its zero was taken, and both edges were looked for beside where they are."""
+    backend = BatchBackend(load_machine("kang-2023"), seed=1)
+    zeroed = False
+
+    def stop(rows):
+        nonlocal zeroed
+        if not zeroed and rows["homing_id"].any():
+            zeroed = True
+            stage.ask_to_stop()  # before the edges are touched: that takes 10 s
+
+    with Supervisor(load_profile("kang-2023"), backend, tmp_path / "run", observe=stop) as stage:
+        assert stage.home().stop is Stop.OPERATOR
+        truth = backend.rig.truth.arrays()
+    rows = read_run(tmp_path / "run").rows
+    zero_t_ns = rows["sample_t_ns"][int(np.flatnonzero(rows["homing_id"])[0])]
+    relative_m = truth["end_position_m"] - truth["macro_position_m"]
+    assert np.abs(relative_m).max() > 1e-3
+    assert abs(np.interp(zero_t_ns, truth["t_ns"], relative_m)) < 50e-6
 
 
 @pytest.mark.parametrize("cause", ["pressure", "lease"])
