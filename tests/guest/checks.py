@@ -12,6 +12,7 @@ from breakage import (
     can_down,
     clock_stepped,
     out_of_memory,
+    recorded,
     serial_unplugged,
     servo_killed,
     supervisor_hung,
@@ -30,7 +31,7 @@ GROUPS: dict[str, tuple[tuple[Group, ...], tuple[Group, ...]]] = {
         (ready, opened),
         (
             serial_unplugged, servo_killed, supervisor_killed, supervisor_hung, out_of_memory,
-            moved, clock_stepped, can_down,
+            moved, clock_stepped, can_down, recorded,
         ),
     ),
 }  # fmt: skip

@@ -22,7 +22,10 @@ def identified() -> bool:
     found = stage.do("identify", duration_s=IDENTIFY_S)["backlash"]
     width_m, sd_m = found["width_m"], found["width_sd_m"]
     report.say(f"        {width_m * 1e6:.2f} um, {WIDTH_M * 1e6:.2f} true, sd {sd_m * 1e6:.2f}")
-    return abs(width_m - WIDTH_M) <= 1.96 * sd_m
+    check("a width is known to a micrometre", 0.0 < 2.0 * sd_m < 1e-6)
+    return (
+        check("a width is no outlier", abs(width_m - WIDTH_M) <= 3.3 * sd_m) and abs(width_m - WIDTH_M) <= 1.96 * sd_m
+    )
 
 
 def moved() -> None:
