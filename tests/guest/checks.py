@@ -7,6 +7,7 @@ of the two; names of groups in the file `only` (from $GUEST_CHECKS) leave out th
 import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from breakage import (
     can_down,
@@ -23,6 +24,7 @@ from motions import moved
 from opening import opened, real_time
 from stage_pc import HERE, UNIT, Failed, check, report, rig, shell
 
+CLOCK = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 Group = Callable[[], None]
 # For each machine of run.sh: what all else rests on, then what can be left out.
 GROUPS: dict[str, tuple[tuple[Group, ...], tuple[Group, ...]]] = {
@@ -52,6 +54,7 @@ def main() -> int:
     """Do it all; 1 where a check failed."""
     names = (HERE / "only").read_text().split()
     before = everything()
+    report.say(f"        its clock is {CLOCK.read_text().strip()}")
     foundation, groups = GROUPS[(HERE / "machine").read_text().strip()]
     if all(tried(what) for what in foundation):
         for what in groups:

@@ -14,7 +14,7 @@ SCAN = {
         {"target_m": -0.01},
     ],
 }
-IDENTIFY_S = 30.0
+IDENTIFY_S = 15.0
 
 
 def identified() -> bool:
