@@ -23,9 +23,9 @@ HUB = RIG_FOLDER / "can.socket"
 UART = "/dev/virtio-ports/interferometer"
 UNIT = "stagectl.service"
 PORT = "/dev/stagectl/LASER001-if00"
-PATIENCE_S = 180.0  # a start of the servo, emulated
+PATIENCE_S = 600.0  # a start of service and servo, emulated on a host that is busy
 _LEASE_S = 20.0
-_ANSWER_S = 20.0
+_ANSWER_S = 60.0
 _REST_S = 30.0
 # Compiled for every x86-64.
 GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
