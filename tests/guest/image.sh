@@ -191,7 +191,10 @@ fi
 base=$FOLDER/base-$({ sed '/^make_release_before/,$d' "${BASH_SOURCE[0]}" && dependencies; } | hash_of)
 disk=$FOLDER/disk-$({ cat "${BASH_SOURCE[0]}" "$HERE"/{warm.py,machine.toml,stage-100hz.toml} && cd "$SOURCE" &&
   sources | xargs -0 sha256sum; } | hash_of).ext4
-[ -d "$base" ] || make_base "$base"
+[ -d "$base" ] || {
+  for old in "$FOLDER"/base-*; do remove "$old"; done
+  make_base "$base"
+}
 [ -s "$disk" ] || make_disk "$base" "$disk"
 ln -sfn "$(basename "$base")/vmlinuz" "$FOLDER/vmlinuz"
 ln -sfn "$(basename "$base")/initrd" "$FOLDER/initrd"
