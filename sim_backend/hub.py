@@ -24,6 +24,7 @@ _FILTER = struct.Struct("=II")
 _STATISTICS = struct.Struct("=4sQQ")
 _PACKET_LIMIT_BYTES = 65536
 _BACKLOG = 16
+_BUS_LOSES = (errno.ENETDOWN, errno.ENOBUFS)
 
 Received = tuple[int, int, bytes]
 """A frame from a client: (the client's descriptor, id with flags, payload)."""
@@ -37,6 +38,7 @@ class _Client:
     filters: list[tuple[int, int]] | None = None  # None = everything passes
     relayed_count: int = 0
     lost_count: int = 0
+    is_bus: bool = False  # an interface that others share, no process: it may be down, and up again
     passes: dict[int, bool] = field(default_factory=dict)  # id -> does it match; filled as ids come by
 
     def wants(self, can_id: int) -> bool:
@@ -92,6 +94,15 @@ class Hub:
         """How many clients are connected."""
         return len(self._clients)
 
+    @property
+    def is_on_bus(self) -> bool:
+        """Whether a CAN interface is joined."""
+        return any(client.is_bus for client in self._clients.values())
+
+    def join(self, bus: socket.socket) -> None:
+        """Relay to and from a non-blocking raw socket of a CAN interface, too, until the interface is gone."""
+        self._clients[bus.fileno()] = _Client(bus, is_bus=True)
+
     def read(self, fileno: int) -> list[Received]:
         """Serve a readable descriptor until it is empty; return the frames that its client sent."""
         if fileno == self._server.fileno():
@@ -104,7 +115,9 @@ class Hub:
                 packet = client.link.recv(_PACKET_LIMIT_BYTES)
             except BlockingIOError:
                 break
-            except OSError:
+            except OSError as error:
+                if client.is_bus and error.errno == errno.ENETDOWN:
+                    break
                 packet = b""
             if not packet:
                 self._drop(fileno)
@@ -150,8 +163,9 @@ class Hub:
             client.link.send(packet)
         except BlockingIOError:
             return False
-        except OSError:
-            self._drop(client.link.fileno())
+        except OSError as error:
+            if not (client.is_bus and error.errno in _BUS_LOSES):
+                self._drop(client.link.fileno())
             return False
         return True
 

@@ -22,6 +22,7 @@ from sim_backend.hub import ERROR_FLAG, Hub
 from sim_backend.machine import Machine, load_machine
 from sim_backend.object_dictionary import RIG_VENDOR_ID
 from sim_backend.pty_port import PtyPort
+from sim_backend.real_wires import UartPort, can_link
 from sim_backend.rig import Rig, warm
 from stagectl.errors import ProfileError, RecordError, StagectlError
 
@@ -42,15 +43,18 @@ class RigProcess:
     """Rig, hub and serial port on one real clock."""
 
     def __init__(
-        self, machine: Machine, socket_path: Path, pty_link: Path | None, seed: int, faults: list[Fault]
+        self,
+        machine: Machine,
+        socket_path: Path,
+        port: PtyPort | UartPort,
+        can: str | None,
+        seed: int,
+        faults: list[Fault],
     ) -> None:
         self.hub = Hub(socket_path, self._answer)
-        try:
-            self.port = PtyPort(pty_link)
-        except StagectlError:
-            self.hub.close()
-            raise
+        self.port = port
         self.machine = machine
+        self._can = can
         self.rig = Rig(machine, seed, _now_t_ns(), faults, truth_limit_s=_TRUTH_LIMIT_S)
         self._delayed: list[tuple[int, int, int, bytes, int]] = []  # instant, number, id, payload, sender
         self._delayed_count = 0
@@ -69,6 +73,7 @@ class RigProcess:
             now_t_ns = _now_t_ns()
             if now_t_ns >= parent_t_ns:
                 parent_t_ns = now_t_ns + _PARENT_PERIOD_NS
+                self._join_bus()
                 if end_t_ns is None and os.getppid() != parent_pid:
                     end_t_ns = now_t_ns + round(1e9 * linger_s)
             if end_t_ns is not None and now_t_ns >= end_t_ns:
@@ -87,6 +92,13 @@ class RigProcess:
                 for sender, can_id, payload in self.hub.read(fileno):
                     self._pass(can_id, payload, sender)
             self._serve_time(_now_t_ns())
+
+    def _join_bus(self) -> None:
+        """Put the drives on the CAN interface as soon as there is one, and again when it comes back."""
+        if self._can is not None and not self.hub.is_on_bus:
+            link = can_link(self._can)
+            if link is not None:
+                self.hub.join(link)
 
     def _next_t_ns(self) -> int:
         due = self.rig.next_wake_t_ns
@@ -190,7 +202,10 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("machine", help="machine file, or the name of one in sim_backend/machines")
     parser.add_argument("--socket", type=Path, required=True, help="path of the CAN hub's socket")
-    parser.add_argument("--pty-link", type=Path, help="link to make to the interferometer's pseudo-terminal")
+    parser.add_argument("--can", help="SocketCAN interface to put the drives on, too, once it is there")
+    line = parser.add_mutually_exclusive_group()
+    line.add_argument("--pty-link", type=Path, help="link to make to the interferometer's pseudo-terminal")
+    line.add_argument("--uart", type=Path, help="serial port that the interferometer writes to, in place of one")
     parser.add_argument("--seed", type=int, default=0, help="seed of all noise (default 0)")
     parser.add_argument("--faults", type=Path, help="TOML file with [[faults]] tables, instants from the start")
     parser.add_argument("--truth", type=Path, help="write what really happened to this .npz file at the end")
@@ -198,6 +213,12 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
         "--linger-s", type=float, default=0.0, help="go on this long after the parent's end (default 0)"
     )
     return parser.parse_args(argv)
+
+
+def _port_of(arguments: argparse.Namespace, machine: Machine) -> PtyPort | UartPort:
+    if arguments.uart is None:
+        return PtyPort(arguments.pty_link)
+    return UartPort(arguments.uart, machine.interferometer.baud_bit_per_s)
 
 
 def _faults_from(path: Path | None) -> list[Fault]:
@@ -224,7 +245,12 @@ def main(argv: list[str] | None = None) -> int:
         machine = load_machine(arguments.machine)
         faults = _faults_from(arguments.faults)
         warm(machine)
-        served = RigProcess(machine, arguments.socket, arguments.pty_link, arguments.seed, faults)
+        port = _port_of(arguments, machine)
+        try:
+            served = RigProcess(machine, arguments.socket, port, arguments.can, arguments.seed, faults)
+        except StagectlError:
+            port.close()
+            raise
     except StagectlError as error:
         print(json.dumps({"ready": False, "error": str(error)}), flush=True)
         return 2

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from drivers import cia402
 from stagectl import trajectory as trajectories
 from stagectl.backlash import HOLD_RATIO, filter_time_s
@@ -24,6 +26,9 @@ from stagectl.touch_sweep import (
 
 _INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
 _TOUCH_TRIES = 4
+_STANDSTILL_WINDOW_S = 0.2
+_STANDSTILL_M = 20e-6  # in that time: 0.1 um in a cycle of 1 ms
+_STANDSTILL_TIMEOUT_S = 3.0
 _JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
 
 
@@ -33,17 +38,14 @@ class Homing(StreamMotion):
     def home(self) -> Outcome:
         """Home the macro by its drive, set its laser, touch both edges, set the end's laser, centre."""
         first_row = self.recorder.rows_count
-        stop = self._home_drive()
-        if stop is not Stop.NONE:
-            return self._outcome("home", stop, first_row)
-        self.pump(0.3)
-        status = self._await_sensor()
-        macro_scale, end_scale = self._scales()
-        macro_zero = float(status["macro_counts"]) - float(status["macro_encoder_m"]) / macro_scale
-        # At rest without power the spring stands at its middle: end = macro there, until the edges say better.
-        end_zero = float(status["end_counts"]) - float(status["macro_encoder_m"]) / end_scale
-        self._homing_id += 1
-        self._publish_update(macro_zero, end_zero)
+        try:
+            stop = self._home_drive() or self._await_standstill()
+            if stop is not Stop.NONE:
+                return self._outcome("home", stop, first_row)
+            macro_zero, end_zero = self._take_zeros()
+        finally:
+            self._request(mode=int(Mode.IDLE))
+        self._leave_homing()
         estimate = None
         if self.profile.micro is not None:
             held = self.armed()
@@ -56,6 +58,43 @@ class Homing(StreamMotion):
             self.take_backlash(estimate)
         self._event("homing", number=self._homing_id, macro_zero_counts=macro_zero, end_zero_counts=end_zero)
         return self._outcome("home", Stop.FINISHED, first_row, estimate)
+
+    def _take_zeros(self) -> tuple[float, float]:
+        """Set the lasers' zeros by the encoder while the macro's drive holds; returns them, in counts."""
+        status = self.status()
+        macro_scale, end_scale = self._scales()
+        macro_zero = float(status["macro_counts"]) - float(status["macro_encoder_m"]) / macro_scale
+        # At rest without power the micro's spring stands at its middle: end = macro, until the edges say better.
+        end_zero = float(status["end_counts"]) - float(status["macro_encoder_m"]) / end_scale
+        self._homing_id += 1
+        self._publish_update(macro_zero, end_zero)
+        return macro_zero, end_zero
+
+    def _await_standstill(self) -> Stop:
+        """Wait until the lasers see the stage stand: they and the encoder tell of instants a cycle apart.
+
+        The macro must, held by its drive; the micro swings on its spring, and is waited for as long as that pays.
+        Returns what ended the hold, NONE where it stands. DriveError where the macro moves on.
+        """
+        window_rows = round(_STANDSTILL_WINDOW_S * self.profile.cycle.rate_hz)
+        give_up_t_ns = self.link.now_t_ns() + round(_STANDSTILL_TIMEOUT_S * 1e9)
+        status = self._await_sensor()
+        while status["phase"] != Phase.STOPPED:
+            self.pump(_STANDSTILL_WINDOW_S)
+            status = self._await_sensor()
+            rows = self.link.rows.read_last(window_rows)
+            # From the least to the greatest: where a swing turns round, it is as far after a while as before.
+            macro_m, end_m = (float(np.ptp(rows[f"{axis}_position_m"])) for axis in ("macro", "end"))
+            over = self.link.now_t_ns() > give_up_t_ns
+            if macro_m <= _STANDSTILL_M and (over or end_m <= _STANDSTILL_M):
+                return Stop.NONE
+            if over:
+                raise DriveError(
+                    f"homing: the macro still moves by {macro_m * 1e6:.0f} um in {_STANDSTILL_WINDOW_S:g} s, limit "
+                    f"{_STANDSTILL_M * 1e6:g} um, {_STANDSTILL_TIMEOUT_S:g} s after its drive found the index; check "
+                    "that the drive's position loop holds there, then home again"
+                )
+        return Stop(int(status["stop"]))
 
     def _touch(self) -> Outcome:
         """Sweep until both edges have been pressed; a first guess of the end's zero may be off by half the gap.
@@ -98,7 +137,7 @@ class Homing(StreamMotion):
         return _INDEX_METHODS[1] if float(self.status()["macro_encoder_m"]) < 0.0 else _INDEX_METHODS[0]
 
     def _home_drive(self) -> Stop:
-        """Let the macro's drive find its index; where there is none on the one side, on the other.
+        """Let the macro's drive find its index, and hold there; where there is none on the one side, on the other.
 
         A stage that was connected anew does not know on which side of the index it stands.
         """
@@ -131,15 +170,15 @@ class Homing(StreamMotion):
         self._request(mode=int(Mode.HOME_DRIVE))
         self.pump()
         status = self._wait(lambda s: s["phase"] == Phase.HOMED_DRIVE, homing.timeout_s, "homing the macro")
-        stop = Stop(int(status["stop"]))
-        self._request(mode=int(Mode.IDLE))
-        if stop is Stop.NONE:
-            self._wait(
-                lambda s: cia402.state_of(int(s["macro_statusword"])) is cia402.State.SWITCH_ON_DISABLED, 5.0, "resting"
-            )
-            mode = cia402.MODE_CSP if self.profile.macro.mode == "position" else cia402.MODE_CST
-            master.write(node, cia402.MODES_OF_OPERATION, 0, mode)
-        return stop
+        return Stop(int(status["stop"]))
+
+    def _leave_homing(self) -> None:
+        """Wait until the macro's drive has let go, and give it back the mode that the servo works in."""
+        self._wait(
+            lambda s: cia402.state_of(int(s["macro_statusword"])) is cia402.State.SWITCH_ON_DISABLED, 5.0, "resting"
+        )
+        mode = cia402.MODE_CSP if self.profile.macro.mode == "position" else cia402.MODE_CST
+        self.master.write(self.profile.macro.node_id, cia402.MODES_OF_OPERATION, 0, mode)
 
     def take_backlash(self, estimate: BacklashEstimate) -> None:
         """Believe an identified backlash; the end's zero moves so that the gap's centre is where the profile has it.

@@ -459,8 +459,8 @@ class Recovery:
 
     rows_count: int
     """Rows that the ring had and the file had not."""
-    rows_lost_count: int
-    """Rows that the ring had already overwritten when it was drained."""
+    rows_lost_count: int | None
+    """Rows that the ring had already overwritten when it was drained; None where the ring itself is gone."""
 
 
 def recover(ring_path: Path, folder: Path, keep_ring: bool = False) -> Recovery:
@@ -476,7 +476,31 @@ def recover(ring_path: Path, folder: Path, keep_ring: bool = False) -> Recovery:
         raise RecordError(f"{ring_path}: its servo (pid {reader.writer_pid}) is alive; stop it before recovering")
     if reader.run_folder is not None and reader.run_folder.resolve() != folder.resolve():
         raise RecordError(f"{ring_path}: holds rows of {reader.run_folder}, not of {folder}; recover them there")
-    held_rows = reader.read_new()
+    recovery = _save(
+        folder,
+        manifest,
+        reader.read_new(),
+        reader.lost_count,
+        f"the ring {ring_path} keeps them until the host restarts",
+    )
+    if not keep_ring:
+        ring_path.unlink(missing_ok=True)
+    return recovery
+
+
+def finish_left(folder: Path, rows_lost_count: int | None) -> Recovery:
+    """Mark a run that its recorder left, and of which no ring holds anything, as recovered up to its last whole batch.
+
+    Errors: RecordError; the run is as it was then, and the call can be repeated.
+    """
+    folder = Path(folder)
+    return _save(folder, read_manifest(folder), np.zeros(0, ROW), rows_lost_count, "the run is as it was")
+
+
+def _save(
+    folder: Path, manifest: dict, held_rows: np.ndarray, overwritten_count: int | None, otherwise: str
+) -> Recovery:
+    """Join rows to a run and mark it as recovered; `otherwise` says what becomes of them where the disk is full."""
     try:
         samples = WholeFile(folder / SAMPLES, resume=True)
     except BlockingIOError as error:
@@ -484,39 +508,38 @@ def recover(ring_path: Path, folder: Path, keep_ring: bool = False) -> Recovery:
     except OSError as error:
         raise RecordError(f"{folder}: can't go on with {SAMPLES}: {error.strerror}; check permissions") from error
     try:
-        recovery = _join(samples, folder, manifest, held_rows, reader.lost_count)
+        recovery = _join(samples, folder, manifest, held_rows, overwritten_count)
         samples.put(END_MARKER)
         _finish_recovered(folder, manifest, recovery)
     except OSError as error:
         raise RecordError(
-            f"{folder}: can't write recovered rows: {error.strerror} ({free_text(folder)}); the ring {ring_path} keeps "
-            "them until the host restarts; free space on that disk and recover again"
+            f"{folder}: can't write recovered rows: {error.strerror} ({free_text(folder)}); {otherwise}; "
+            "free space on that disk and recover again"
         ) from error
     finally:
         samples.close()
-    if not keep_ring:
-        ring_path.unlink(missing_ok=True)
     return recovery
 
 
-def _join(samples: WholeFile, folder: Path, manifest: dict, held_rows: np.ndarray, overwritten_count: int) -> Recovery:
+def _join(
+    samples: WholeFile, folder: Path, manifest: dict, held_rows: np.ndarray, overwritten_count: int | None
+) -> Recovery:
     """Cut the samples at their last whole batch and append the rows that are newer. Errors: RecordError, OSError."""
     schema, end_bytes, last = None, 0, None
     for piece in scan(folder / SAMPLES):
         schema, end_bytes = piece.schema, piece.end_bytes
         if piece.batch is not None and len(piece.batch):
             last = _rows_of(piece, folder / SAMPLES)[-1]
-    if schema is not None and not schema.equals(schema_of()):
+    if len(held_rows) and schema is not None and not schema.equals(schema_of()):
         raise RecordError(
             f"{folder}: {SAMPLES} has another layout than the ring; recover with the version that made it"
         )
     start_t_ns = manifest.get("start_t_ns", np.iinfo(np.int64).min) if last is None else int(last["t_ns"]) + 1
     rows = held_rows[held_rows["t_ns"] >= start_t_ns]
-    lost_count = 0
-    if overwritten_count and last is None:
-        lost_count = overwritten_count
-    elif overwritten_count and last is not None and len(rows) == len(held_rows) and len(rows):
-        lost_count = max(0, int(rows["cycle"][0]) - int(last["cycle"]) - 1)
+    lost_count = overwritten_count
+    if overwritten_count and last is not None:  # the file may have them
+        apart = len(rows) == len(held_rows) and len(rows) > 0
+        lost_count = max(0, int(rows["cycle"][0]) - int(last["cycle"]) - 1) if apart else 0
     samples.cut(end_bytes)
     if schema is None:
         samples.put(encode_schema(schema_of()))

@@ -27,7 +27,7 @@ class Phase(IntEnum):
     IDLE = 0
     ENABLING = 1
     HOMING_DRIVE = 2
-    HOMED_DRIVE = 3
+    HOMED_DRIVE = 3  # the macro's drive holds where it found its index, until something else than HOME_DRIVE is asked
     TRACKING = 4
     STOPPING = 5  # under the law, towards rest
     QUICK_STOP = 6  # by the drives

@@ -57,6 +57,9 @@ _UNPOWERED_STOPS = (Stop.OPERATOR, Stop.FINISHED)
 
 _POWERED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia402.State.FAULT_REACTION_ACTIVE)
 
+_DRIVE_HOMES = (Phase.HOMING_DRIVE, Phase.HOMED_DRIVE)
+"""The start of its homing stays set while the drive holds the index: a second edge would search again."""
+
 RELEASE_CYCLES = 100
 """What a drive has for showing that it is without power, before a servo that was asked to leaves."""
 
@@ -242,7 +245,7 @@ class Servo:
                 micro_target = cia402.State.QUICK_STOP_ACTIVE
         macro_word = self._controlword(seen.macro_statusword, macro_target)
         micro_word = self._controlword(seen.micro_statusword, micro_target)
-        if self.phase is Phase.HOMING_DRIVE and macro_word == cia402.ENABLE_OPERATION:
+        if self.phase in _DRIVE_HOMES and macro_word == cia402.ENABLE_OPERATION:
             macro_word |= cia402.HOMING_START
         frames = []
         micro_frame = self.encoder.micro(micro_word, decided.micro_word)
@@ -398,6 +401,8 @@ class Servo:
                     self._enter(Phase.ENABLING if mode is Mode.TRACK else Phase.HOMING_DRIVE, t_ns)
             elif mode is Mode.IDLE:
                 self._enter(Phase.IDLE, t_ns)
+            elif self.phase is Phase.HOMED_DRIVE and mode is Mode.HOME_DRIVE:
+                return self._homing(mode, macro_state, silent, t_ns)
             return off, off
         if self.phase is Phase.HOMING_DRIVE:
             return self._homing(mode, macro_state, silent, t_ns)
@@ -512,7 +517,7 @@ class Servo:
         return cia402.State.QUICK_STOP_ACTIVE, cia402.State.OPERATION_ENABLED
 
     def _homing(self, mode: Mode, state: cia402.State, silent: bool, t_ns: int) -> tuple[cia402.State, cia402.State]:
-        """Let the macro's drive home; the micro stays without power."""
+        """Let the macro's drive home, and hold where it is then; the micro stays without power."""
         off, on = cia402.State.SWITCH_ON_DISABLED, cia402.State.OPERATION_ENABLED
         seen = self._seen
         if silent or mode is not Mode.HOME_DRIVE or seen.lease_left_ns <= 0:
@@ -523,14 +528,15 @@ class Servo:
         if stop is not Stop.NONE:
             self._end(stop, Phase.QUICK_STOP, t_ns, text)
             return cia402.State.QUICK_STOP_ACTIVE, off
-        if state in (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE):
+        homed = self.phase is Phase.HOMED_DRIVE  # one that let go by itself would search again
+        if state in (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE) or (homed and state is not on):
             self._end(Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns, self._detail(Stop.DRIVE_FAULT))
             return cia402.State.QUICK_STOP_ACTIVE, off
-        if state is on and (t_ns - self._phase_since_t_ns) * 1e-9 > 0.05:
+        if not homed and state is on and (t_ns - self._phase_since_t_ns) * 1e-9 > 0.05:
             progress = cia402.homing_of(seen.macro_statusword)
             if progress is cia402.Homing.ATTAINED:
                 self._enter(Phase.HOMED_DRIVE, t_ns)
-                return off, off
+                return on, off
             if progress in (cia402.Homing.ERROR, cia402.Homing.ERROR_MOVING):
                 text = "the macro's drive gave its homing up; check index, limit switches and macro.homing"
                 self._end(Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns, text)

@@ -1,151 +1,42 @@
-"""What a stage PC has to show, in order: installed, started, upgraded, read back, restarted, removed.
+"""What a stage PC has to show: installed, upgraded, opened, read back, removed; or hurt in every way, moved, removed.
 
-Runs as root in the guest. One line a check; exit code 1 where one failed. Names of groups in the file `only` beside
-this one (from $GUEST_CHECKS) leave out the others.
+Runs as root in the guest. One line a check; exit code 1 where one failed. The file `machine` beside this one says which
+of the two; names of groups in the file `only` (from $GUEST_CHECKS) leave out the others.
 """
 
-import os
-import shutil
-import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import stage_pc
-from stage_pc import UNIT, Failed, pids, shell, unit, until
+from breakage import (
+    can_down,
+    clock_stepped,
+    out_of_memory,
+    recorded,
+    serial_unplugged,
+    servo_killed,
+    supervisor_hung,
+    supervisor_killed,
+)
+from installation import confined, everything, installed, ready, removed, upgraded
+from motions import moved
+from opening import opened, real_time
+from stage_pc import HERE, UNIT, Failed, check, report, rig, shell
 
-INSTALL = "/srv/stagectl/deploy/install.sh"
-INSTALL_BEFORE = "/srv/before/deploy/install.sh"
-PROGRAM = Path("/opt/stagectl")
-PORT = "/dev/stagectl/LASER001-if00"
-PROFILE = Path("/etc/stagectl/stage-100hz.toml")
-RUNS = Path("/var/lib/stagectl/runs")
-DROP_IN = Path("/etc/systemd/system/stagectl.service.d/guest.conf")
-FOLDERS = ("/etc", "/opt", "/usr/local", "/var/lib", "/var/cache", "/run/stagectl", "/dev/shm", "/dev/stagectl")
-# The system's own: its state, and the copies that it keeps of the accounts' files.
-OF_THE_SYSTEM = (
-    "/var/lib/systemd/", "/var/lib/dbus/", "/var/cache/ldconfig/", "/etc/ld.so.cache", "/etc/machine-id",
-    "/etc/passwd-", "/etc/group-", "/etc/shadow-", "/etc/gshadow-", "/etc/subuid-", "/etc/subgid-", "/etc/.pwd.lock",
-)  # fmt: skip
-# Between packages and sources only the links count: what lies in an environment is pip's.
-ENVIRONMENT = "/venv/"
-EXPOSURE_LIMIT = 2.0
-LIMITS = [["unlimited", "unlimited"], ["60", "60"]]
-
-report = stage_pc.Report()
-stage = stage_pc.Stage()
-check = report.check
-
-
-def everything() -> set[str]:
-    """Return all paths and accounts that an installation could leave behind."""
-    found = set()
-    for folder in FOLDERS:
-        for place, folders, files in os.walk(folder):
-            folders[:] = [name for name in folders if f"/{name}/" != ENVIRONMENT]
-            found.update(f"{place}/{name}" for name in [*folders, *files])
-    accounts = [*Path("/etc/passwd").read_text().split("\n"), *Path("/etc/group").read_text().split("\n")]
-    return {path for path in found if not path.startswith(OF_THE_SYSTEM)} | {line for line in accounts if line}
-
-
-# ---- installed -------------------------------------------------------------------------------------------------
-
-
-def bring_release(before: bool) -> None:
-    """Put a release that the image has unpacked where install.sh would unpack it; that one finds it there."""
-    for folder in Path("/srv/releases").iterdir():
-        if (folder / "CHANGELOG.md").read_text().endswith("The release before.\n") == before:
-            PROGRAM.mkdir(exist_ok=True)
-            folder.rename(PROGRAM / folder.name)
-
-
-def installed() -> None:
-    """The release before is installed, twice, and given a profile and a run."""
-    bring_release(before=True)
-    shell(INSTALL_BEFORE, "install")
-    first = everything()
-    shell(INSTALL_BEFORE, "install")
-    check("installing a second time changes nothing", everything() == first, sorted(everything() ^ first)[:10])
-    shutil.copy(stage_pc.HERE / PROFILE.name, PROFILE)
-    Path("/etc/stagectl/stagectl.env").write_text(f"STAGECTL_SERVE={PROFILE.stem} --backend hardware\n")
-    shutil.copytree("/srv/runs", RUNS, dirs_exist_ok=True)
-    shell("chown", "-R", "stagectl:stagectl", str(RUNS))
-    DROP_IN.parent.mkdir(parents=True)
-    generic = " ".join(f"{name}={value}" for name, value in stage_pc.GENERIC.items())
-    DROP_IN.write_text(f"[Service]\nEnvironment={generic}\n")
-    shell("systemctl", "daemon-reload")
-
-
-def upgraded() -> None:
-    """Without hardware it waits and says so; an upgrade stops it, keeps what is yours, and starts it again."""
-    shell("systemctl", "start", UNIT)
-    waits = stage.await_state("off")["waiting_for"]
-    check("without hardware it waits, and says so", "vcan0" in waits and "LASER001" not in waits, waits)
-    yours = [path for folder in (PROFILE.parent, RUNS) for path in folder.rglob("*") if path.is_file()]
-    content = [path.read_bytes() for path in yours]
-    release = os.readlink(PROGRAM / "current")
-    bring_release(before=False)
-    shell(INSTALL, "upgrade")
-    now = os.readlink(PROGRAM / "current")
-    check("an upgrade switches to the new release", now != release, now)
-    kept = len(yours) > 3 and all(path.exists() for path in yours) and [path.read_bytes() for path in yours] == content
-    check("an upgrade keeps profile, settings and runs", kept, f"{len(yours)} files")
-    check("an upgrade starts again what ran", unit("ActiveState") == "active")
-    listed = until("the runs", lambda: stage.ask("GET", "/v1/runs"))
-    check("the runs are listed", listed, [run["name"] for run in listed])
-
-
-def confined() -> None:
-    """Hardening and real time that the unit gives, read back from /proc and from systemd."""
-    pid = int(unit("MainPID"))
-    facts = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
-    capabilities = [facts[name].strip() for name in ("CapEff", "CapPrm", "CapInh", "CapAmb", "CapBnd")]
-    check("it has no capability, and no way to one", set(capabilities) == {"0" * 16}, capabilities)
-    secure = facts["NoNewPrivs"].strip(), facts["Seccomp"].strip()
-    check("it gains no privileges, and its system calls are filtered", secure == ("1", "2"), secure)
-    check("it is no root", facts["Uid"].split()[0] != "0", facts["Uid"].split())
-    check("it has two CPUs, the servo's among them", os.sched_getaffinity(pid) == {0, 1}, os.sched_getaffinity(pid))
-    limits = Path(f"/proc/{pid}/limits").read_text()
-    granted = [line.split()[3:5] for line in limits.splitlines() if line.startswith(("Max realtime p", "Max locked"))]
-    check("it may lock memory, and run at priority 60", granted == LIMITS, granted)
-    check("the kernel is PREEMPT_RT", Path("/sys/kernel/realtime").read_text().strip() == "1", os.uname().release)
-    exposure = shell("systemd-analyze", "security", "--no-pager", UNIT).strip().split("\n")[-1]
-    level = float(exposure.split(f"{UNIT}:")[1].split()[0])
-    check(f"exposure is at most {EXPOSURE_LIMIT}", level <= EXPOSURE_LIMIT, level)
-    tty = Path(os.path.realpath(PORT)).name
-    latency = Path(f"/sys/bus/usb-serial/devices/{tty}/latency_timer").read_text().strip()
-    check("the adapter has its name, and hands out within 1 ms", latency == "1", f"{tty}, {latency} ms")
-
-
-def watchdog() -> None:
-    """The supervisor hangs: the watchdog ends it, and systemd brings the service back."""
-    before = int(unit("NRestarts"))
-    os.kill(int(unit("MainPID")), signal.SIGSTOP)
-    until("a restart", lambda: int(unit("NRestarts")) > before and unit("ActiveState") == "active")
-    said = shell("journalctl", "-u", UNIT, "--no-pager", "-o", "cat")
-    check("a supervisor that hangs is restarted by the watchdog", "Watchdog timeout" in said)
-    check("it answers again", stage.await_state("off")["waiting_for"])
-
-
-GROUPS: tuple[Callable[[], None], ...] = (confined, watchdog)
-
-
-# ---- removed ---------------------------------------------------------------------------------------------------
-
-
-def removed(before: set[str]) -> None:
-    """It stops as asked, and leaves nothing."""
-    shell("systemctl", "stop", UNIT)
-    check("it stops without a complaint", unit("Result") == "success", unit("Result"))
-    check("nothing of it runs", not pids("."), pids("."))
-    shell(INSTALL, "uninstall")
-    after = everything()
-    check("uninstall leaves nothing", not after - before, sorted(after - before)[:20])
-    check("and takes nothing of others", not before - after, sorted(before - after)[:20])
-    leaves = subprocess.run(["systemctl", "cat", UNIT], capture_output=True).returncode != 0
-    check("systemd knows no such unit any more", leaves)
+CLOCK = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+Group = Callable[[], None]
+# For each machine of run.sh: what all else rests on, then what can be left out.
+GROUPS: dict[str, tuple[tuple[Group, ...], tuple[Group, ...]]] = {
+    "installation": ((installed, upgraded, opened), (confined, real_time)),
+    "motion": (
+        (ready, opened),
+        (
+            serial_unplugged, servo_killed, supervisor_killed, supervisor_hung, out_of_memory,
+            moved, clock_stepped, can_down, recorded,
+        ),
+    ),
+}  # fmt: skip
 
 
 def tried(what: Callable[[], None]) -> bool:
@@ -161,14 +52,17 @@ def tried(what: Callable[[], None]) -> bool:
 
 def main() -> int:
     """Do it all; 1 where a check failed."""
-    names = (stage_pc.HERE / "only").read_text().split()
+    names = (HERE / "only").read_text().split()
     before = everything()
-    if all(tried(what) for what in (installed, upgraded)):
-        for what in GROUPS:
+    report.say(f"        its clock is {CLOCK.read_text().strip()}")
+    foundation, groups = GROUPS[(HERE / "machine").read_text().strip()]
+    if all(tried(what) for what in foundation):
+        for what in groups:
             if not names or what.__name__ in names:
                 tried(what)
     tried(partial(removed, before))
     if report.failed:
+        print(rig.said())
         print(shell("journalctl", "-u", UNIT, "--no-pager", "-o", "short-monotonic")[-12000:])
     print(f"{report.count} checks, {len(report.failed)} failed", *report.failed, sep="; ")
     return 1 if report.failed else 0

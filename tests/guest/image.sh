@@ -138,10 +138,18 @@ make_release_before() { # ROOT
     "$root/opt/stagectl/$before"/venv/lib/python3*/site-packages/{__editable__*,stagectl-*} | xargs -0 sed -i "s/$name/$before/g"
 }
 
+# Never through what a build that was killed left mounted there: that is this host's /dev.
+remove() { # FOLDER
+  local place
+  while read -r place; do umount "$place"; done < <(awk -v at="$1/" 'index($2, at) == 1 {print $2}' /proc/mounts | sort -r)
+  rm -rf --one-file-system "$1"
+}
+
 make_disk() { # BASE TO
   local root=$FOLDER/root
   say "this repository, installed"
-  rm -rf "$root" "$FOLDER"/disk-*
+  remove "$root"
+  rm -rf "$FOLDER"/disk-*
   cp -a "$1/root" "$root"
   mkdir -p "$root/srv/stagectl"
   (cd "$SOURCE" && sources | tar --null -c -T -) | tar -C "$root/srv/stagectl" -x
@@ -163,10 +171,12 @@ make_disk() { # BASE TO
   say "the disk"
   truncate -s $(($(du -sm "$root" | cut -f1) + 700))M "$FOLDER/disk.part"
   mke2fs -q -F -t ext4 -O ^has_journal -d "$root" "$FOLDER/disk.part"
-  rm -rf "$root"
+  remove "$root"
   mv "$FOLDER/disk.part" "$2"
 }
 
+trap 'exit 130' INT
+trap 'exit 143' TERM HUP
 mkdir -p "$FOLDER"
 # The host's own mirror, where it is a Debian 12 itself.
 MIRROR=(http://deb.debian.org/debian)
@@ -181,7 +191,10 @@ fi
 base=$FOLDER/base-$({ sed '/^make_release_before/,$d' "${BASH_SOURCE[0]}" && dependencies; } | hash_of)
 disk=$FOLDER/disk-$({ cat "${BASH_SOURCE[0]}" "$HERE"/{warm.py,machine.toml,stage-100hz.toml} && cd "$SOURCE" &&
   sources | xargs -0 sha256sum; } | hash_of).ext4
-[ -d "$base" ] || make_base "$base"
+[ -d "$base" ] || {
+  for old in "$FOLDER"/base-*; do remove "$old"; done
+  make_base "$base"
+}
 [ -s "$disk" ] || make_disk "$base" "$disk"
 ln -sfn "$(basename "$base")/vmlinuz" "$FOLDER/vmlinuz"
 ln -sfn "$(basename "$base")/initrd" "$FOLDER/initrd"

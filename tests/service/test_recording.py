@@ -9,8 +9,9 @@ import pytest
 
 from stagectl.errors import RecordError
 from stagectl.flight_recorder import FlightRecorder
+from stagectl.left_runs import finish_left_runs
 from stagectl.profile import PROFILES_FOLDER
-from stagectl.record import MANIFEST, Recorder, read_run, recover
+from stagectl.record import MANIFEST, Recorder, Recovery, read_run, recover, recover_orphans
 from stagectl.requests import Phase
 from stagectl.retention import KEEP, prune
 from stagectl.ring import RingWriter
@@ -93,6 +94,42 @@ def test_what_a_dead_recorder_left_in_the_ring_goes_where_it_belongs(tmp_path, u
     rows = read_run(target).rows
     assert rows["cycle"].tolist() == list(range(500))
     assert recovery.rows_lost_count == 0
+
+
+def test_what_a_dead_service_left_is_marked_and_goes_with_the_others(tmp_path):
+    """Its session's own folder has no ring; the power takes the ring of a motion; another's run is not touched."""
+    root, shared = tmp_path / "runs", tmp_path / "shm"
+    shared.mkdir()
+    dead, powerless, living, awaited = (flight(root) for _ in range(4))
+    for session in (powerless, living, awaited):
+        session.begin_run("motion", "arm", 0)
+        session.append(rows_from(0, 200))
+        session.append(rows_from(200, 50))  # no batch yet
+    own = Recorder(root / "own", {})
+    ring = RingWriter(shared / "stagectl-a.ring", 1024, run_folder=awaited.recovery_folder.absolute())
+    ring.write(rows_from(250, 1))
+    ring.close()
+    motions = {session.folder: session.run_folder for session in (powerless, living, awaited)}
+    for session in (dead, powerless, awaited):
+        session.abandon()
+    own.abandon()
+    outcomes = dict(finish_left_runs(root, shared))
+    assert set(outcomes) == {dead.folder, powerless.folder, awaited.folder, motions[powerless.folder]}
+    assert finish_left_runs(root, shared) == []
+    states = {one.folder: (one.state, one.rows_count) for one in list_runs(root)}
+    assert states[dead.folder] == states[powerless.folder] == states[awaited.folder] == ("recovered", 0)
+    assert states[motions[powerless.folder]] == ("recovered", 200)
+    assert states[motions[living.folder]][0] == states[living.folder][0] == "recording"
+    assert states[motions[awaited.folder]][0] == states[own.folder][0] == "crashed"
+    run = read_run(motions[powerless.folder])
+    assert not run.truncated
+    assert run.manifest["record"]["rows_lost_count"] is None
+    assert read_run(dead.folder).manifest["record"]["rows_lost_count"] == 0
+    ((_, recovery),) = recover_orphans(shared)
+    assert recovery == Recovery(1, 0)
+    living.close()
+    gone = prune(root, 0.0, 1e9, now_s=2e9)
+    assert {one.folder for one in gone} == {*states} - {own.folder}
 
 
 @pytest.mark.parametrize("policy", ["stop", "go_on"])

@@ -1,0 +1,200 @@
+"""Hurt in every way, and recovered: what docs/operations.md says of each fault."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stage_pc import PORT, UNIT, check, report, rig, servo_pid, shell, stage, unit, until
+
+FAR_M, STRUCK_M = 0.1, 0.03
+HOMING_M_PER_S = 0.02  # stage-100hz.toml
+AT_REST_M_PER_S = 2e-4
+# Heartbeat time of the drives, the ramp from the speed limit, and how seldom it is looked at; a servo that lost its
+# supervisor waits for it first.
+DRIVES_STOP_S = 5.0
+SERVO_STOPS_S = DRIVES_STOP_S + 2.0
+REST_PATIENCE_S = 60.0
+STEP_S = 2.0
+RUNS = Path("/var/lib/stagectl/runs")
+MEMORY_SHARE = 0.7  # of what the servo has locked: enough for the supervisor alone
+
+
+@contextmanager
+def moving() -> Iterator[None]:
+    """A stage under way to a far target, well off its index; the lease is held."""
+    with stage.lease():
+        stage.do("arm" if stage.status()["homed"] else "home")
+        stage.begin("move", target_m=FAR_M)
+        until("a stage under way", lambda: rig.end_m() > STRUCK_M)
+        yield
+
+
+@contextmanager
+def homing() -> Iterator[None]:
+    """A stage whose macro drive looks for its index by itself, from where the last fault left it; the lease is held."""
+
+    def searches() -> bool:
+        # A stage without power moves, too: cogging and cables pull.
+        state = rig.state()
+        fast = abs(state["plant"]["macro_velocity_m_per_s"]) > 0.9 * HOMING_M_PER_S
+        return fast and state["drives"]["1"] == "OPERATION_ENABLED"
+
+    with stage.lease():
+        stage.begin("home")
+        until("the drive looks for its index", searches)
+        yield
+
+
+def stops(what: str, began_s: float, limit_s: float = DRIVES_STOP_S) -> None:
+    """Wait until the plant rests and no drive follows commands any more; a check of how long that took."""
+
+    def rests() -> bool:
+        state = rig.state()
+        slow = abs(state["plant"]["macro_velocity_m_per_s"]) < AT_REST_M_PER_S
+        return slow and "OPERATION_ENABLED" not in state["drives"].values()
+
+    until(f"{what}: rest without power", rests, REST_PATIENCE_S)
+    took_s = time.monotonic() - began_s
+    check(f"{what}: the drives stop the stage", took_s < limit_s, f"{took_s:.1f} s, {rig.state()['drives']}")
+
+
+def faulted(what: str, *kinds: str) -> None:
+    """Check that a fault says what it was."""
+    fault = stage.await_state("fault")["fault"]
+    check(f"{what}: a fault says so", fault["kind"] in kinds, f"{fault['kind']}: {fault['values'][:150]}")
+
+
+def recovers(what: str) -> None:
+    """Acknowledge what there is, and come to idle without a restart by hand."""
+    if stage.await_state("idle", "fault", "off")["state"] == "fault":
+        fault = stage.acknowledge()
+        report.say(f"        fault {fault['kind']}: {fault['what']}: {fault['values'][:150]}; {fault['remedy']}")
+    stage.await_state("idle")
+    check(f"{what}: idle again", unit("ActiveState") == "active", f"{unit('NRestarts')} restarts")
+    shell("systemctl", "reset-failed", UNIT)
+
+
+def await_restart(what: str, before: int) -> None:
+    """Wait for systemd's restart, and check it."""
+
+    def restarted() -> bool:
+        return int(unit("NRestarts")) > before and unit("ActiveState") == "active"
+
+    until(f"{what}: a restart", restarted, period_s=3.0)
+    check(f"{what}: systemd brings the service back", True)
+
+
+def recorded() -> None:
+    """After all that, every run is there, and no row is missing."""
+    runs = {run["name"]: run["state"] for run in stage.ask("GET", "/v1/runs")}
+    lost = [run for run in runs.items() if run[1] not in ("closed", "recovered", "recording")]
+    check("every run is whole, or was recovered", len(runs) > 5 and not lost, lost or sorted(runs.values()))
+    records = [json.loads((RUNS / name / "manifest.json").read_text())["record"] for name in runs]
+    lost_count = [record["rows_lost_count"] for record in records if record["state"] == "recovered"]
+    check("no row of them is lost", lost_count and not any(lost_count), f"{len(lost_count)} recovered: {lost_count}")
+
+
+def clock_stepped() -> None:
+    """Somebody sets the clock, an hour on and back: nothing happens."""
+    with stage.lease():
+        stage.do("arm")
+        before = stage.status()["health"]
+        for step in ("+1 hour", "-1 hour"):
+            shell("date", "--set", step)
+            time.sleep(STEP_S)
+        after = stage.status()
+        went_on = after["health"]["cycles_count"] - before["cycles_count"] > STEP_S * before["rate_hz"]
+        check("clock stepped: it holds the stage", went_on and after["state"] == "armed", after["fault"])
+
+
+def can_down() -> None:
+    """The CAN interface is taken down under a moving stage, and comes up again."""
+    with moving():
+        began_s = time.monotonic()
+        shell("ip", "link", "set", "vcan0", "down")
+        stops("vcan0 down", began_s)
+    faulted("vcan0 down", "LINK_LOST", "LINK_SILENT", "LinkError")
+    shell("ip", "link", "set", "vcan0", "up")
+    recovers("vcan0 up")
+
+
+def serial_unplugged() -> None:
+    """The interferometer's adapter is pulled under a moving stage, and plugged in again."""
+    serials = Path("/sys/bus/usb/devices").glob("*/serial")
+    adapter = next(path.parent for path in serials if path.read_text().strip() in PORT)
+    with homing():
+        began_s = time.monotonic()
+        (adapter / "authorized").write_text("0")
+        stops("unplugged", began_s)
+    faulted("unplugged", "LINK_LOST", "SENSOR_AGE", "LinkError")
+    check("unplugged: homing is void", not stage.status()["homed"])
+    stage.acknowledge()
+    waits = until("unplugged: it waits", lambda: stage.status()["waiting_for"])
+    check("unplugged: it waits for the port", "LASER001" in waits, waits)
+    (adapter / "authorized").write_text("1")
+    until(PORT, lambda: os.path.exists(PORT), 30.0)
+    recovers("plugged in")
+
+
+def servo_killed() -> None:
+    """The servo is killed under a moving stage."""
+    with homing():
+        began_s = time.monotonic()
+        os.kill(servo_pid(), signal.SIGKILL)
+        stops("servo killed", began_s)
+    faulted("servo killed", "LinkError")
+    recovers("servo killed")
+
+
+def supervisor_killed() -> None:
+    """The supervisor is killed under a moving stage: the servo stops it, systemd brings the service back."""
+    before = int(unit("NRestarts"))
+    with homing():
+        began_s = time.monotonic()
+        os.kill(int(unit("MainPID")), signal.SIGKILL)
+        stops("supervisor killed", began_s, SERVO_STOPS_S)
+    await_restart("supervisor killed", before)
+    recovers("supervisor killed")
+
+
+def supervisor_hung() -> None:
+    """The supervisor hangs while the drive homes: the stage stops, the watchdog ends the service, and it restarts."""
+    before = int(unit("NRestarts"))
+    with homing():
+        began_s = time.monotonic()
+        os.kill(int(unit("MainPID")), signal.SIGSTOP)
+        stops("supervisor hangs", began_s, SERVO_STOPS_S)
+    await_restart("supervisor hangs", before)
+    said = shell("journalctl", "-u", UNIT, "--no-pager", "-o", "cat")
+    check("supervisor hangs: it was the watchdog", "Watchdog timeout" in said)
+    recovers("supervisor hangs")
+
+
+def out_of_memory() -> None:
+    """The kernel kills for want of memory while the drive homes: the stage stops, and it goes on without a hand."""
+    before, supervisor = int(unit("NRestarts")), int(unit("MainPID"))
+    group = Path(f"/sys/fs/cgroup{unit('ControlGroup')}")
+
+    def killed() -> int:
+        return int(dict(line.split() for line in (group / "memory.events").read_text().splitlines())["oom_kill"])
+
+    with homing():
+        facts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        began_s = time.monotonic()
+        (group / "memory.max").write_text(str(round(MEMORY_SHARE * int(facts["unevictable"]))))
+        until("the kernel kills", killed, period_s=0.02)
+        # There is memory again. The supervisor may be gone, too: the servo's 600 MB are not free at once.
+        (group / "memory.max").write_text("max")
+        stops("out of memory", began_s, SERVO_STOPS_S)
+    said = shell("journalctl", "-k", "--no-pager", "-o", "cat").splitlines()
+    names = [line.split("Killed process ")[1].split(",")[0] for line in said if "Killed process" in line]
+    check("out of memory: the kernel killed", names, names)
+    if supervisor != int(unit("MainPID")):
+        await_restart("out of memory", before)
+    else:
+        faulted("out of memory", "LinkError")
+    recovers("out of memory")

@@ -1,0 +1,93 @@
+"""Homing sets the zeros of a stage that stands, held by its drive; a drive that lets go of it stays without power."""
+
+import numpy as np
+import pytest
+
+from drivers import cia402
+from sim_backend.faults import Fault
+from sim_backend.machine import load_machine
+from stagectl.backend import BatchBackend
+from stagectl.profile import load_profile
+from stagectl.record import read_run
+from stagectl.requests import Phase
+from stagectl.signals import Stop
+from stagectl.supervisor import Supervisor
+from tests.stage import with_values
+
+MACRO = 1
+PRESSURE = 0x1_0000
+
+
+def on_a_slope(machine):
+    """Copy a machine that cogging of 20 N pulls away from its index the hardest."""
+    cogging = {"amplitude_n": 20.0, "phase_rad": np.pi / 2}
+    effects = [{**row, **cogging} if row["name"] == "cogging" else row for row in map(dict, machine.effects)]
+    assert any(row["name"] == "cogging" for row in effects)
+    return with_values(machine, effects=effects)
+
+
+def test_zeros_are_those_of_a_stage_that_stands(tmp_path, single_profile, single_machine):
+    """Laser and encoder tell of instants a cycle apart: one that rolled was homed micrometres off."""
+    backend = BatchBackend(on_a_slope(single_machine), seed=1)
+    with Supervisor(single_profile, backend, tmp_path / "run") as stage:
+        assert stage.home().finished
+        truth = backend.rig.truth.arrays()
+    rows = read_run(tmp_path / "run").rows
+    zero_row = int(np.flatnonzero(rows["homing_id"])[0])
+    after = rows[zero_row : zero_row + 20]
+    true_m = np.interp(after["sample_t_ns"], truth["t_ns"], truth["macro_position_m"])
+    assert np.abs(after["macro_position_m"] - true_m).max() < 0.2e-6
+    assert after["run_phase"][0] == Phase.HOMED_DRIVE
+    assert cia402.state_of(int(after["macro_statusword"][0])) is cia402.State.OPERATION_ENABLED
+
+
+def test_the_micro_has_come_to_rest_on_its_spring(tmp_path):
+    """It swung by 0.9 mm still when its zero was taken, and both edges were looked for beside where they are."""
+    backend = BatchBackend(load_machine("kang-2023"), seed=1)
+    zeroed = False
+
+    def stop(rows):
+        nonlocal zeroed
+        if not zeroed and rows["homing_id"].any():
+            zeroed = True
+            stage.ask_to_stop()  # before the edges are touched: that takes 10 s
+
+    with Supervisor(load_profile("kang-2023"), backend, tmp_path / "run", observe=stop) as stage:
+        assert stage.home().stop is Stop.OPERATOR
+        truth = backend.rig.truth.arrays()
+    rows = read_run(tmp_path / "run").rows
+    zero_t_ns = rows["sample_t_ns"][int(np.flatnonzero(rows["homing_id"])[0])]
+    relative_m = truth["end_position_m"] - truth["macro_position_m"]
+    assert np.abs(relative_m).max() > 1e-3
+    assert abs(np.interp(zero_t_ns, truth["t_ns"], relative_m)) < 50e-6
+
+
+@pytest.mark.parametrize("cause", ["pressure", "lease"])
+def test_a_drive_that_lets_go_after_its_homing_gets_no_power_again(cause, tmp_path, single_profile, single_machine):
+    """It would search its index a second time."""
+    backend = BatchBackend(on_a_slope(single_machine), seed=1)
+    homed = False
+
+    def strike(rows):
+        nonlocal homed
+        if not homed and Phase.HOMED_DRIVE in rows["run_phase"]:
+            homed = True
+            if cause == "pressure":
+                fault = Fault("input", node_id=MACRO, bits=PRESSURE, duration_s=0.02)
+                backend.rig.inject(fault, backend.wire.t_ns)
+
+    def lease_left_s() -> float:
+        return 0.0 if homed and cause == "lease" else np.inf
+
+    with Supervisor(single_profile, backend, tmp_path / "run", observe=strike, lease_left_s=lease_left_s) as stage:
+        outcome = stage.home()
+        stage.pump(0.5)
+    assert outcome.stop in ((Stop.EMERGENCY, Stop.DIGITAL_INPUT) if cause == "pressure" else (Stop.LEASE,))
+    rows = read_run(tmp_path / "run").rows
+    held = np.flatnonzero(rows["run_phase"] == Phase.HOMED_DRIVE)
+    states = [cia402.state_of(int(word)) for word in rows["macro_statusword"]]
+    powered = np.array([state is cia402.State.OPERATION_ENABLED for state in states])
+    assert powered[held[0]]
+    assert not powered[held[-1] + 5 :].any()
+    assert not rows["homing_id"].any()
+    assert np.ptp(rows["macro_encoder_m"][held[0] :]) < 0.5e-3  # it stays there, and is not sent off again
