@@ -40,8 +40,9 @@ def _later(recording: Recording, effect: Effect, place: str, parameters: list[fl
     total = Forces()
     for sign, late in ((1.0, (*others, row)), (-1.0, others)):
         there = put_together(
-            recording.log, recording.believed, recording.macro, recording.end, recording.on_command, late
-        )
+            recording.log, recording.believed, recording.macro, recording.end,
+            recording.on_command, late, recording.edges_out_m,
+        )  # fmt: skip
         add_forces(total, scaled_forces(_exchanged(there), sign, Forces()))
     return total
 
@@ -148,8 +149,14 @@ def _edges_moved(
     if not whole:
         stiffness = quantities(recording, "end", "contact_edge")["contact_stiffness_n_per_m"]
         return between(recording, -recording.side * value * stiffness)
-    out_m = {}
+    return between(recording, more_contact_n(recording, joint, 0.0, 0.0, *edges_out_m(recording, effect, parameters)))
+
+
+def edges_out_m(recording: Recording, effect: Effect, parameters: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much an effect moves the left and the right edge outward, on parts of intervals."""
+    known = quantities(recording, "end", "contact_edge")
+    out_m = []
     for side in (-1.0, 1.0):
-        known = quantities(recording, "end", "contact_edge") | {"contact_side_ratio": np.full_like(value, side)}
-        out_m[side] = along_motion(effect, [known[name] for name in effect.quantities], parameters)
-    return between(recording, more_contact_n(recording, joint, 0.0, 0.0, out_m[-1.0], out_m[1.0]))
+        sided = known | {"contact_side_ratio": np.full_like(known["contact_side_ratio"], side)}
+        out_m.append(along_motion(effect, [sided[name] for name in effect.quantities], parameters))
+    return out_m[0], out_m[1]
