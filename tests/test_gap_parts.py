@@ -136,6 +136,19 @@ def test_names_are_as_far_apart_as_what_they_say():
     assert judge.distance([one], [other]) == pytest.approx(0.09 * 3 * 4000, rel=0.15)
 
 
+@pytest.mark.parametrize(("share", "is_alias"), [(1.0, False), (0.7, True)])
+def test_two_laws_are_one_set_where_recordings_lie_between_them(share, is_alias):
+    """100 squares apart, of 108 thousand that both gain; at 0.7 of the way one is preferred by 40, by what it is not."""
+
+    def draw(run, random):
+        common, apart = random.standard_normal(4000), random.standard_normal(4000) * np.sqrt(100.0 / 12_000.0)
+        return [random.standard_normal(4000) + 3.0 * common + share * apart, 3.0 * common + apart, 3.0 * common]
+
+    one, other = (Group((name, "macro_sensor"), (column,)) for name, column in (("one", 1), ("other", 2)))
+    judge = _table_judge(draw, [one, other])
+    assert [key[0] for key, _ in judge.aliases([one], one)] == ["other"] * is_alias
+
+
 def test_a_belief_that_fitting_made_worse_is_what_the_gap_is_counted_from():
     """The known parameter looks like the hidden term in the runs of the fit, and like its opposite in the third."""
     random = np.random.default_rng(5)

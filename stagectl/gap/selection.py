@@ -48,6 +48,10 @@ apart: power 0.9 at 5 % false alarms. Of the likelihoods as they came out (whose
 about it) half of all pairs at that distance would count as one."""
 
 ALIAS_SHARE = 0.002
+"""Of what a name gains, the margin below which two names are one set where recordings lie between what they say."""
+
+BETWEEN_SDS = 3.0
+"""From so many deviations of the noise on, what two names say differently is said by neither."""
 
 LOW_SPEED_SHARE = 0.02
 """Of a machine with more force noise than its sensors explain, no friction is an exact law: at speed, where a velocity
@@ -340,8 +344,9 @@ class Judge:
             if other.key in taken or _form(other) > _form(group) or not self._allowed([*rest, other]):
                 continue
             margin = with_it - self.gain([*rest, other])
-            too_near = self.distance([*rest, group], [*rest, other]) < ALIAS_GAIN
-            if too_near or margin < self._inexact_share(group, other) * gained:
+            apart = self.distance([*rest, group], [*rest, other])
+            inexact = margin < self._inexact_share(group, other) * gained and _lies_between(margin, apart)
+            if apart < ALIAS_GAIN or inexact:
                 margins[other.key] = margin
         return sorted(margins.items(), key=lambda row: row[1])
 
@@ -373,6 +378,15 @@ class Judge:
         if self.is_rough and _shows_at_low_speed(group) and _shows_at_low_speed(other):
             return LOW_SPEED_SHARE
         return ALIAS_SHARE
+
+
+def _lies_between(margin: float, apart: float) -> bool:
+    """Tell whether recordings lie between two names, `apart` squares from each other, by more than noise does.
+
+    An exact law beats the other one by their distance, give or take twice its root. What gains less than that is no
+    exact law, and its margin no proof.
+    """
+    return margin < apart - BETWEEN_SDS * 2.0 * float(np.sqrt(max(apart, 0.0)))
 
 
 def _form(group: Group) -> int:
