@@ -345,8 +345,9 @@ class Judge:
                 continue
             margin = with_it - self.gain([*rest, other])
             apart = self.distance([*rest, group], [*rest, other])
-            inexact = margin < self._inexact_share(group, other) * gained and _lies_between(margin, apart)
-            if apart < ALIAS_GAIN or inexact:
+            if apart < ALIAS_GAIN or self._is_inexact(
+                group, other, margin / max(gained, 1e-300), _lies_between(margin, apart)
+            ):
                 margins[other.key] = margin
         return sorted(margins.items(), key=lambda row: row[1])
 
@@ -373,11 +374,11 @@ class Judge:
             total += float(apart @ s.gram @ apart)
         return total
 
-    def _inexact_share(self, group: Group, other: Group) -> float:
-        """Return the share of a gain that two laws must differ by to be told apart."""
+    def _is_inexact(self, group: Group, other: Group, share: float, lies_between: bool) -> bool:
+        """Tell whether the share of a gain that two laws differ by may come from laws that are inexact."""
         if self.is_rough and _shows_at_low_speed(group) and _shows_at_low_speed(other):
-            return LOW_SPEED_SHARE
-        return ALIAS_SHARE
+            return share < LOW_SPEED_SHARE
+        return share < ALIAS_SHARE and lies_between
 
 
 def _lies_between(margin: float, apart: float) -> bool:
