@@ -1,7 +1,7 @@
 """Strong effects in the gap workflow: found where they are, at their size, without false names beside them."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -55,9 +55,8 @@ def _recordings() -> tuple[Recording, ...]:
     return tuple(balance.recording_of(_axis_under(_rippled_n, seed), AXIS) for seed in (1, 2))
 
 
-def test_a_ripple_of_the_force_constant_stands_out_in_step_with_the_motor():
-    """Over position alone its line is split by the force that turns its sign: 14.1 and 17.3 mm beside 15.4."""
-    recordings = _recordings()
+def _signals(recordings: Sequence[Recording]) -> list[np.ndarray]:
+    """What known parameters leave, as forces."""
     signals = []
     for recording in recordings:
         balance.set_noise(recording, slow_noise(AXIS, recording))
@@ -66,9 +65,43 @@ def test_a_ripple_of_the_force_constant_stands_out_in_step_with_the_motor():
         evidence.add_all([term for term, _ in terms])
         left = evidence.rest(0, 0, np.array([sd for _, sd in terms]))
         signals.append(seeds.force_signal(recording, "macro", left))
+    return signals
+
+
+def test_a_ripple_of_the_force_constant_stands_out_in_step_with_the_motor():
+    """Over position alone its line is split by the force that turns its sign: 14.1 and 17.3 mm beside 15.4."""
+    recordings = _recordings()
+    signals = _signals(recordings)
     driven = seeds.pitches_m(recordings, "macro", seeds.in_step_with_motor(recordings, "macro", signals))
     assert driven[0] == pytest.approx(PITCH_M, rel=0.01)
     assert abs(seeds.pitches_m(recordings, "macro", signals)[0] / PITCH_M - 1.0) > 0.05
+
+
+def test_a_pitch_of_few_periods_stands_out_of_noise_where_it_does_not_of_its_neighbours():
+    """Less than two over the way, where a spectrum has no peak that is narrower than the whole of it."""
+    pitch_m = 60e-3
+    recordings = [
+        balance.recording_of(
+            _axis_under(lambda n, x, v: n * (1.0 + RIPPLE * np.sin(2.0 * np.pi * x / pitch_m + 0.7)), seed), AXIS
+        )
+        for seed in (1, 2)
+    ]
+    driven = seeds.in_step_with_motor(recordings, "macro", _signals(recordings))
+    noise = seeds.of_noise(recordings, "macro", np.random.default_rng(0))
+    noise = [seeds.in_step_with_motor(recordings, "macro", draw) for draw in noise]
+    span_m = max(float(np.ptp(r.position_m("macro"))) for r in recordings)
+    found_m = seeds.pitches_m(recordings, "macro", driven, noise)[0]
+    assert span_m / found_m == pytest.approx(span_m / pitch_m, abs=0.5)  # as far as a search reaches
+
+
+def test_a_wide_line_stands_out_of_noise_and_not_of_its_neighbours():
+    """Thirty bins wide, ten thousand times the noise: above its neighbours by less than noise is here and there."""
+    random = np.random.default_rng(2)
+    wide = 1e4 * np.exp(-(((np.arange(400) - 60) / 30.0) ** 2))
+    power = random.exponential(size=400) * (1.0 + wide)
+    smooth = np.ones(400) + wide
+    assert all(abs(place - 60) > 15 for place in seeds._peaks(random.exponential(size=400) + smooth, 1.0, 2.0, 390.0))
+    assert abs(seeds._peaks(power, 1.0, 2.0, 390.0, np.ones(400))[0] - 60) <= 30
 
 
 def test_a_strong_effect_is_searched_until_nothing_is_left_and_does_not_raise_the_noise():
