@@ -13,6 +13,7 @@ from stagectl.gap.competition import Competition
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.log import Log
 from stagectl.gap.noise import slow_noise
+from stagectl.gap.normal_equations import Group
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner
 
@@ -135,3 +136,40 @@ def test_the_pitch_of_a_force_that_is_no_sine_is_searched_as_well():
     outcome = Refiner(evidence, []).refined(seed)
     assert outcome is not None
     assert outcome[0].shape["pitch_m"] == pytest.approx(PITCH_M, rel=2e-4)
+
+
+def _swinging(share: float, frequency_hz: float, damping: float) -> Callable[[float, float, float], float]:
+    """Return what is left of a command to an axis of which a share swings on a spring, step by step."""
+    at = [0.0, 0.0]
+    w = 2.0 * np.pi * frequency_hz
+
+    def made_n(command_n: float, x: float, v: float) -> float:
+        pull = -(command_n / MASS + 2.0 * damping * w * at[1] + w * w * at[0]) / (1.0 - share)
+        at[1] += pull * H / STEPS
+        at[0] += at[1] * H / STEPS
+        return command_n - share * MASS * pull
+
+    return made_n
+
+
+def test_a_mass_that_swings_is_all_that_a_motion_leaves_that_knows_nothing_of_it():
+    """At its own size. Driven by the acceleration that a filter foretold, part of the ringing drove it as well."""
+    recordings = [balance.recording_of(_axis_under(_swinging(0.12, 17.5, 0.04), seed), AXIS) for seed in (1, 2)]
+    for recording in recordings:
+        balance.set_noise(recording, slow_noise(AXIS, recording))
+    evidence = Evidence(recordings)
+    true = {"share_ratio": 0.12, "frequency_hz": 17.5, "damping_ratio": 0.04}
+    place = "macro_force"
+    terms = [
+        hypotheses.term_at_size(CATALOGUE["flexible_mode"], place, true | {"share_ratio": share})
+        for share in (0.12, 0.114, 0.126)
+    ]
+    groups = [Group(term.key, columns) for term, columns in zip(terms, evidence.add_all(terms), strict=True)]
+    evidence.finish(np.zeros(0), 0, 0)
+    left = []
+    for group in groups:
+        (column,) = group.columns
+        at_size = [s.gram[0, 0] - 2.0 * s.gram[0, column] + s.gram[column, column] - s.count for s in evidence.sums]
+        left.append(sum(at_size))
+    noise = np.sqrt(2.0 * sum(s.count for s in evidence.sums))
+    assert left[0] < 4.0 * noise < min(left[1:])  # the ringing reaches the frequencies that noise is read off

@@ -42,8 +42,11 @@ def recording_of(
     return foretold_under(rough, known_forces(rough))
 
 
-def foretold_under(recording: Recording, forces: Forces) -> Recording:
-    """Return a recording with the motion that follows from its past and from the forces that are thought to act."""
+def foretold_under(recording: Recording, forces: Forces, found: Forces | None = None) -> Recording:
+    """Return a recording with the motion that follows from its past and from the forces that are thought to act.
+
+    found: what of these drives a share of the mass that swings, besides what is believed.
+    """
     log, believed = recording.log, recording.believed
     motions: list[Motion | None] = [None, None]
     for k, (axis, force_n) in enumerate(zip(AXES, (forces.macro_n, forces.end_n), strict=True)):
@@ -52,10 +55,12 @@ def foretold_under(recording: Recording, forces: Forces) -> Recording:
                 recording.motion(axis), recording.position_m(axis), log.valid, force_n, recording.mass_kg(axis),
                 log.period_s, recording.belief(axis).noise_m,
             )  # fmt: skip
-    return put_together(
+    there = put_together(
         log, believed, motions[0] or recording.macro, motions[1],
         recording.on_command, recording.late, recording.edges_out_m,
     )  # fmt: skip
+    there.found = recording.found if found is None else found
+    return there
 
 
 def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = True) -> None:

@@ -1,6 +1,6 @@
 """One log with all that does not depend on a hypothesis: motion, motor forces, where the joint touches. Pure."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from stagectl.gap import late_readings
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.command_path import delayed, driven
 from stagectl.gap.contact import Contact, contact_at
+from stagectl.gap.forces import Forces
 from stagectl.gap.innovations import Noise
 from stagectl.gap.late_readings import Row
 from stagectl.gap.log import Log
@@ -42,6 +43,7 @@ class Recording:
     on_command: tuple[Row, ...] = ()  # effects of the command path that were found, as rows of a profile
     late: tuple[Row, ...] = ()  # effects that make readings those of earlier instants
     edges_out_m: EdgesOut = (0.0, 0.0)
+    found: Forces = field(default_factory=Forces)  # of effects that were found, of which none is part of the above
 
     @property
     def axes(self) -> tuple[str, ...]:
