@@ -232,6 +232,19 @@ def test_a_small_name_beside_a_large_one_stays_where_no_curve_finds_anything(is_
     assert len(judge.select()) == count
 
 
+def test_of_two_places_that_a_few_sizes_were_tried_at_the_better_one_is_taken():
+    """A size that fits the wrong place by chance: each place is compared at the size that it asks for."""
+
+    def draw(run, random):
+        right, wrong = random.standard_normal(4000), random.standard_normal(4000)
+        return [random.standard_normal(4000) + 0.5 * right + 0.1 * wrong, right, wrong]
+
+    right, wrong = (Group(("abbe_error", "end_sensor"), (column,)) for column in (1, 2))
+    judge = _table_judge(draw, [right, wrong])
+    judge.gains_at_size = lambda beside, groups: [5000.0 if group is wrong else 4000.0 for group in groups]
+    assert [group.columns for group in judge.rivals([])] == [right.columns]
+
+
 def test_on_noise_nothing_is_named():
     assert _judge(0.0).select() == []
 

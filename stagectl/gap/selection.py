@@ -225,17 +225,23 @@ class Judge:
         """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
         beside = [*self.base, *chosen]
         fold = Fold(beside, self.source.sums, self.source.sums, on_noise=False)
-        best: dict[tuple[str, str], tuple[float, Group]] = {}
+        by_name: dict[tuple[str, str], list[tuple[float, Group]]] = {}
         taken = {group.key for group in chosen}
         open_ones = [group for group in self.library if group.key not in taken]
         for group, at_size in zip(open_ones, self.gains_at_size(beside, open_ones), strict=True):
             gain = max(float(fold.added(group)[0][0]), at_size)
-            worth = gain - self.price() * group.complexity
-            if group.key not in best or worth > best[group.key][0]:
-                best[group.key] = (worth, group)
-        ranked = [group for _, group in sorted(best.values(), key=lambda row: -row[0])]
-        possible = (group for group in ranked[: 4 * most] if self._allowed([*chosen, group]))
-        return self.refine(beside, list(itertools.islice(possible, most)))
+            shapes = by_name.setdefault(group.key, [])
+            shapes.append((gain - self.price() * group.complexity, group))
+            shapes.sort(key=lambda row: -row[0])
+            # at a few sizes only: which of two places is better shows when each has its own
+            del shapes[2 if at_size > 0.0 and not CATALOGUE[group.key[0]].searched else 1 :]
+        ranked = sorted(by_name.values(), key=lambda shapes: -shapes[0][0])
+        possible = (shapes for shapes in ranked[: 4 * most] if self._allowed([*chosen, shapes[0][1]]))
+        found: dict[tuple[str, str], Group] = {}
+        for group in self.refine(beside, [group for shapes in itertools.islice(possible, most) for _, group in shapes]):
+            if group.key not in found or self._worth([*chosen, group]) > self._worth([*chosen, found[group.key]]):
+                found[group.key] = group
+        return list(found.values())
 
     def _note(self, chosen: Sequence[Group], rivals: Sequence[Group]) -> None:
         now = self.gains(chosen)
