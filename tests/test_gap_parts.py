@@ -138,7 +138,7 @@ def test_names_are_as_far_apart_as_what_they_say():
 
 @pytest.mark.parametrize(("share", "is_alias"), [(1.0, False), (0.7, True)])
 def test_two_laws_are_one_set_where_recordings_lie_between_them(share, is_alias):
-    """100 squares apart, of 108 thousand that both gain; at 0.7 of the way one is preferred by 40, by what it is not."""
+    """100 squares apart, of 108 thousand that both gain; at 0.7 of the way one is preferred by 40 only."""
 
     def draw(run, random):
         common, apart = random.standard_normal(4000), random.standard_normal(4000) * np.sqrt(100.0 / 12_000.0)
