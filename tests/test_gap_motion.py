@@ -13,7 +13,7 @@ from stagectl.gap.evidence import Evidence
 from stagectl.gap.findings import Named
 from stagectl.gap.log import Log
 from stagectl.gap.motion import motion_of, motion_under
-from stagectl.gap.naming import friction_that_drives
+from stagectl.gap.naming import friction_that_drives, second_pitches
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group
 from stagectl.gap.operating_point import operating_point, with_joint_changed
@@ -175,3 +175,16 @@ def test_a_friction_that_changes_along_the_way_never_drives(slope_n_per_m, level
     dry = Named("coulomb_friction", "macro_force", {"level_n": level_n}, {"level_n": 0.001}, 9.0, 9.0, ())
     elsewhere = dataclasses.replace(dry, acts_on="micro_force", parameters={"level_n": 9.0})
     assert friction_that_drives([along, dry, elsewhere], [recording]) == (along,) * drives
+
+
+def test_one_axis_has_forces_of_one_pitch():
+    first, second, elsewhere = (
+        Named(name, place, {"pitch_m": pitch_m}, {}, gain, gain, ())
+        for name, place, pitch_m, gain in (
+            ("cogging", "macro_force", 0.084, 900.0),
+            ("harmonic_cogging", "macro_force", 0.131, 70.0),
+            ("cogging", "micro_force", 0.02, 5.0),
+        )
+    )
+    assert second_pitches([second, elsewhere, first]) == (second,)
+    assert second_pitches([first, elsewhere]) == ()
