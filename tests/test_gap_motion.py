@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from stagectl.effects import CATALOGUE
-from stagectl.gap import balance
+from stagectl.gap import balance, hypotheses
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.effect_forces import effect_forces, known_forces
+from stagectl.gap.evidence import Evidence
 from stagectl.gap.findings import Named
 from stagectl.gap.log import Log
 from stagectl.gap.motion import motion_of, motion_under
-from stagectl.gap.naming import friction_that_drives
+from stagectl.gap.naming import friction_that_drives, second_pitches
 from stagectl.gap.noise import slow_noise
+from stagectl.gap.normal_equations import Group
 from stagectl.gap.operating_point import operating_point, with_joint_changed
+from stagectl.gap.refinement import Refiner
 from stagectl.gap.settling import settled_by
 
 H, MASS_KG, NOISE_M = 1e-3, 40.0, 5e-9
@@ -124,6 +127,45 @@ def test_what_the_joint_was_settled_by_is_known(touching):
     assert np.max(there.penetration_m) == pytest.approx(np.max(touching.penetration_m) + 0.1e-6, rel=1e-3)
 
 
+def test_edges_that_wear_lie_further_out_at_every_instant(touching):
+    """At 10 um/s and edge, the last swing of four seconds is 35 um less deep than the first, which has lost 1.25 um."""
+    there = operating_point(touching, [(CATALOGUE["backlash_wear"], "contact_edge", {"rate_m_per_s": 20e-6})])
+    crests = [round(s / H) for s in (0.125, 3.625)]
+    lost_m = [float((touching.penetration_m - there.penetration_m)[k].mean()) for k in crests]
+    assert lost_m == pytest.approx([1.25e-6, 36.25e-6], abs=0.02e-6)
+    known = balance.foretold_under(there, known_forces(there))
+    assert np.max(known.penetration_m[crests[1]]) == pytest.approx(50e-6 - 36.25e-6, abs=0.1e-6)
+
+
+def test_an_edge_that_is_far_off_is_found_however_shallow_the_contact():
+    """Both edges lie 24 um further out, where contacts are 11 um deep: a fit at 10 or at 30 um has another contact."""
+    random, out_m = np.random.default_rng(6), 24e-6
+    apart_m = 65e-6 * np.sin(2.0 * np.pi * 2.0 * T_S)
+    middle_m = 65e-6 * np.sin(2.0 * np.pi * 2.0 * (T_S + 0.5 * H))
+    rate = 65e-6 * 4.0 * np.pi * np.cos(4.0 * np.pi * (T_S + 0.5 * H))
+    depth_m = np.maximum(middle_m - JOINT.right_m - out_m, 0.0)
+    press_n = np.maximum(JOINT.right_stiffness_n_per_m * depth_m + 90.0 * rate * (depth_m > 0.0), 0.0)
+    between_n = JOINT.spring_n_per_m * middle_m + JOINT.damping_n_s_per_m * rate + press_n  # on the end
+    both_n = -MASS_KG * W * W * _swing(T_S + 0.5 * H)
+    noise_m = NOISE_M * random.standard_normal((2, COUNT))
+    log = Log(
+        "run", H, _swing(T_S) + apart_m + noise_m[0], both_n + between_n - MASS_KG * 16.0 * np.pi**2 * middle_m,
+        np.ones(COUNT, bool), "1", end_position_m=_swing(T_S) + noise_m[1], micro_command_n=both_n - between_n,
+    )  # fmt: skip
+    recording = balance.recording_of(log, STAGE)
+    balance.set_noise(recording, slow_noise(STAGE, recording))
+    evidence = Evidence([recording])
+    known = hypotheses.parameter_terms(recording)
+    columns = evidence.add_all([term for term, _ in known])
+    base = [Group(term.key, numbers, prior_sds=(sd,)) for (term, sd), numbers in zip(known, columns, strict=True)]
+    evidence.finish(np.array([sd for _, sd in known]), 0, 0)
+    wider = hypotheses.term_of(CATALOGUE["backlash_width_change"], "contact_edge", {})
+    refiner = Refiner(evidence, base)
+    assert refiner.gain_at_size(wider) > 1000.0
+    found, _ = refiner.refined(wider)
+    assert found.shape["change_m"] == pytest.approx(2.0 * out_m, abs=0.2e-6)
+
+
 @pytest.mark.parametrize(("slope_n_per_m", "level_n", "drives"), [(4.0, 0.0, 1), (4.0, 0.09, 0), (-6.0, 0.1, 1)])
 def test_a_friction_that_changes_along_the_way_never_drives(slope_n_per_m, level_n, drives):
     """Over 20 mm to both sides, 4 N/m need a dry friction of 0.08 N."""
@@ -133,3 +175,16 @@ def test_a_friction_that_changes_along_the_way_never_drives(slope_n_per_m, level
     dry = Named("coulomb_friction", "macro_force", {"level_n": level_n}, {"level_n": 0.001}, 9.0, 9.0, ())
     elsewhere = dataclasses.replace(dry, acts_on="micro_force", parameters={"level_n": 9.0})
     assert friction_that_drives([along, dry, elsewhere], [recording]) == (along,) * drives
+
+
+def test_one_axis_has_forces_of_one_pitch():
+    first, second, elsewhere = (
+        Named(name, place, {"pitch_m": pitch_m}, {}, gain, gain, ())
+        for name, place, pitch_m, gain in (
+            ("cogging", "macro_force", 0.084, 900.0),
+            ("harmonic_cogging", "macro_force", 0.131, 70.0),
+            ("cogging", "micro_force", 0.02, 5.0),
+        )
+    )
+    assert second_pitches([second, elsewhere, first]) == (second,)
+    assert second_pitches([first, elsewhere]) == ()

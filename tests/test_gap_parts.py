@@ -136,6 +136,19 @@ def test_names_are_as_far_apart_as_what_they_say():
     assert judge.distance([one], [other]) == pytest.approx(0.09 * 3 * 4000, rel=0.15)
 
 
+@pytest.mark.parametrize(("share", "is_alias"), [(1.0, False), (0.7, True)])
+def test_two_laws_are_one_set_where_recordings_lie_between_them(share, is_alias):
+    """100 squares apart, of 108 thousand that both gain; at 0.7 of the way one is preferred by 40 only."""
+
+    def draw(run, random):
+        common, apart = random.standard_normal(4000), random.standard_normal(4000) * np.sqrt(100.0 / 12_000.0)
+        return [random.standard_normal(4000) + 3.0 * common + share * apart, 3.0 * common + apart, 3.0 * common]
+
+    one, other = (Group((name, "macro_sensor"), (column,)) for name, column in (("one", 1), ("other", 2)))
+    judge = _table_judge(draw, [one, other])
+    assert [key[0] for key, _ in judge.aliases([one], one)] == ["other"] * is_alias
+
+
 def test_a_belief_that_fitting_made_worse_is_what_the_gap_is_counted_from():
     """The known parameter looks like the hidden term in the runs of the fit, and like its opposite in the third."""
     random = np.random.default_rng(5)
@@ -217,6 +230,19 @@ def test_a_small_name_beside_a_large_one_stays_where_no_curve_finds_anything(is_
     large, small = Group(("large", "macro_force"), (1,)), Group(("small", "macro_force"), (2,))
     judge = _table_judge(draw, [large, small], curves=[Group(("curve", "macro_force"), (3,))])
     assert len(judge.select()) == count
+
+
+def test_of_two_places_that_a_few_sizes_were_tried_at_the_better_one_is_taken():
+    """A size that fits the wrong place by chance: each place is compared at the size that it asks for."""
+
+    def draw(run, random):
+        right, wrong = random.standard_normal(4000), random.standard_normal(4000)
+        return [random.standard_normal(4000) + 0.5 * right + 0.1 * wrong, right, wrong]
+
+    right, wrong = (Group(("abbe_error", "end_sensor"), (column,)) for column in (1, 2))
+    judge = _table_judge(draw, [right, wrong])
+    judge.gains_at_size = lambda beside, groups: [5000.0 if group is wrong else 4000.0 for group in groups]
+    assert [group.columns for group in judge.rivals([])] == [right.columns]
 
 
 def test_on_noise_nothing_is_named():

@@ -86,6 +86,7 @@ class Trait(StrEnum):
     TIME_SHIFT = "time shift"  # readings of instants that are further and further off: more than a Taylor series holds
     LATE_READING = "late reading"  # a reading of an earlier instant: two such laws differ in what rounds the motion
     FIRST_ORDER = "first order"  # moves a reading by so little that no force feels it
+    SWINGS = "swings"  # a share of the mass on a spring, driven by what all other forces make of the axis
     PLACED = "placed"  # acts about a place, and none is simpler than another: as plain as the same law about zero
 
 

@@ -43,6 +43,7 @@ def mass_error(acceleration_m_per_s2, mass_kg, error_ratio):
     share_ratio=(0.0, 0.5),
     frequency_hz=(5.0, 500.0),
     damping_ratio=(1e-3, 0.7),
+    traits=(Trait.SWINGS,),
     searched=("frequency_hz", "damping_ratio"),
     shown_by="acceleration",
     symptom="rings at one frequency after each change of acceleration",

@@ -35,6 +35,7 @@ def cogging(position_m, amplitude_n, pitch_m, phase_rad):
     second_phase_rad=_PHASE,
     linear=("first_n", "second_n"),
     session=("first_phase_rad", "second_phase_rad"),
+    searched=("pitch_m",),
     symptom="periodic in position and not a sine, whatever the velocity",
     reference="Roehrig, Jochheim, Proc. ACC 2001: force ripple of linear motors, first two harmonics",
 )

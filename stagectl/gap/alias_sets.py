@@ -12,10 +12,9 @@ from typing import Literal
 import numpy as np
 
 from stagectl.effects import CATALOGUE
-from stagectl.gap.effect_forces import effect_forces, joint_force_n, known_forces, motor_forces
+from stagectl.gap.effect_forces import effect_forces, joint_force_n, motor_forces
 from stagectl.gap.forces import Forces, add_forces, scaled_forces
-from stagectl.gap.hypotheses import Term, parameter_terms, term_of
-from stagectl.gap.quantities import along_motion, quantities
+from stagectl.gap.hypotheses import Term, parameter_terms, term_at_size, term_of
 from stagectl.gap.reading_errors import misread
 from stagectl.gap.recording import Recording
 
@@ -272,17 +271,7 @@ def _cable_loop(r: Recording) -> AliasSet:
 
 def _mode(r: Recording) -> AliasSet:
     known = _known(r)
-    flexible = CATALOGUE["flexible_mode"]
-
-    def ringing(r: Recording) -> Forces:
-        # acceleration by what drives: the measured one's noise would ring, and look like something that was excited
-        driving_n = known_forces(r).macro_n
-        driven = {} if driving_n is None else {"acceleration_m_per_s2": driving_n / r.mass_kg("macro")}
-        known = quantities(r, "macro", "macro_force") | driven
-        arguments = [known[name] for name in flexible.quantities]
-        return Forces(macro_n=along_motion(flexible, arguments, [MODE[name] for name in flexible.parameters]))
-
-    mode = _of("flexible_mode", "macro_force", ringing, "share_of_shape_ratio")
+    mode = term_at_size(CATALOGUE["flexible_mode"], "macro_force", MODE)
     return AliasSet(
         "flexible mode far above the band, delay, mass",
         "mu m (w / w_m)^2 / (1 - (w / w_m)^2 + 2 i z w / w_m) a: at one w a mass error, its small odd part a delay",

@@ -14,7 +14,7 @@ from stagectl.gap.innovations import Noise
 from stagectl.gap.late_readings import Row
 from stagectl.gap.log import Log
 from stagectl.gap.motion import Motion, motion_of, motion_under
-from stagectl.gap.recording import AXES, Recording, put_together
+from stagectl.gap.recording import AXES, EdgesOut, Recording, put_together
 
 _SETTLE_S = 0.3  # the filter forgets how it began
 
@@ -26,19 +26,27 @@ _LOOSE_N = 1e3
 
 
 def recording_of(
-    log: Log, believed: Believed, on_command: tuple[Row, ...] = (), late: tuple[Row, ...] = ()
+    log: Log,
+    believed: Believed,
+    on_command: tuple[Row, ...] = (),
+    late: tuple[Row, ...] = (),
+    edges_out_m: EdgesOut = (0.0, 0.0),
 ) -> Recording:
     """Prepare a log: motion, commands on parts of intervals, contact geometry.
 
-    on_command, late: effects of the command path, and of readings that are late, that act beside what is believed.
+    on_command, late, edges_out_m: effects of the command path, of readings that are late, and what has become of the
+    edges, beside what is believed.
     """
     macro = motion_of(log.macro_position_m, log.period_s, believed.macro.noise_m)
-    rough = put_together(log, believed, macro, None, on_command, late)
+    rough = put_together(log, believed, macro, None, on_command, late, edges_out_m)
     return foretold_under(rough, known_forces(rough))
 
 
-def foretold_under(recording: Recording, forces: Forces) -> Recording:
-    """Return a recording with the motion that follows from its past and from the forces that are thought to act."""
+def foretold_under(recording: Recording, forces: Forces, found: Forces | None = None) -> Recording:
+    """Return a recording with the motion that follows from its past and from the forces that are thought to act.
+
+    found: what of these drives a share of the mass that swings, besides what is believed.
+    """
     log, believed = recording.log, recording.believed
     motions: list[Motion | None] = [None, None]
     for k, (axis, force_n) in enumerate(zip(AXES, (forces.macro_n, forces.end_n), strict=True)):
@@ -47,7 +55,12 @@ def foretold_under(recording: Recording, forces: Forces) -> Recording:
                 recording.motion(axis), recording.position_m(axis), log.valid, force_n, recording.mass_kg(axis),
                 log.period_s, recording.belief(axis).noise_m,
             )  # fmt: skip
-    return put_together(log, believed, motions[0] or recording.macro, motions[1], recording.on_command, recording.late)
+    there = put_together(
+        log, believed, motions[0] or recording.macro, motions[1],
+        recording.on_command, recording.late, recording.edges_out_m,
+    )  # fmt: skip
+    there.found = recording.found if found is None else found
+    return there
 
 
 def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = True) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from stagectl.effects import CATALOGUE
+from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap import balance, hypotheses, seeds
 from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.evidence import Evidence
@@ -20,6 +20,7 @@ from stagectl.gap.refinement import Refiner, but_for_size, counts_at_size, gain_
 from stagectl.gap.selection import Judge
 
 _EXCITED_GAIN = 1e-6
+_SEED = 0  # of the noise that pitches stand out of
 
 
 class Competition:
@@ -61,7 +62,7 @@ class Competition:
 
         library += searched([*wrong, *hypotheses.effect_terms(recordings, grids)])
         self.curves += self._taken(list(hypotheses.curve_terms(recordings)))
-        library += searched(_periodic_terms(evidence, np.array(self._sds)))
+        library += searched(_periodic_terms(evidence, known_sds, np.array(self._sds)))
         evidence.finish(known_sds, nulls_count, seed)
         self._refiner: tuple[tuple[int, ...], Refiner] | None = None
         self.judge = Judge(evidence, training_count, base, library, self._refined, self._gains_at_size)
@@ -133,14 +134,18 @@ class Competition:
         """Return what a group stands for."""
         return self.evidence.terms[group.columns[0]]
 
-    def explained(self, chosen: Sequence[Group]) -> Explained:
-        """Return what known parameters and `chosen` effects add in a recording, at the sizes that all of them give."""
+    def explained(self, chosen: Sequence[Group], but: Trait | None = None) -> Explained:
+        """Return what known parameters and `chosen` effects add in a recording, at the sizes that all of them give.
+
+        but: effects of this trait are left out, of the sum and not of the sizes.
+        """
         solution = solve([*self.judge.base, *chosen], self.evidence.sums)
         values = {
             (column, scope): float(value)
             for (column, scope), value in zip(solution.slots, solution.values, strict=True)
         }
-        terms = [(self.term(group), group) for group in (*self.judge.base[: len(self.parameters)], *chosen)]
+        kept = [group for group in chosen if group.key[0] not in CATALOGUE or but not in CATALOGUE[group.key[0]].traits]
+        terms = [(self.term(group), group) for group in (*self.judge.base[: len(self.parameters)], *kept)]
 
         def of(recording: Recording) -> Forces:
             scopes = ("", f"session {recording.log.session}", f"run {recording.log.name}")
@@ -164,15 +169,28 @@ class Competition:
         return tuple(sorted(f"{term.name} on {term.acts_on}" for key, term in terms.items() if key not in excited))
 
 
-def _periodic_terms(evidence: Evidence, prior_sds: np.ndarray) -> list[Term]:
-    """Make terms of pitches and frequencies that stand out of what all other hypotheses leave."""
+def _periodic_terms(evidence: Evidence, known_sds: np.ndarray, all_sds: np.ndarray) -> list[Term]:
+    """Make terms of pitches and frequencies that stand out.
+
+    Of what all other hypotheses (`all_sds`) leave, above its neighbours; pitches also of what known parameters alone
+    leave, above noise: laws and curves together have a part of every pitch that is not much shorter than the way.
+    """
     recordings = evidence.recordings
+    random = np.random.default_rng(_SEED)
     found: list[Term] = []
     for place, axis in enumerate(recordings[0].axes):
-        signals = [seeds.force_signal(r, axis, evidence.rest(k, place, prior_sds)) for k, r in enumerate(recordings)]
-        pitches = seeds.pitches_m(recordings, axis, signals)
-        driven = seeds.pitches_m(recordings, axis, seeds.in_step_with_motor(recordings, axis, signals))
-        frequencies = seeds.frequencies_hz(recordings, axis, signals)
+        left, unknown = (
+            [seeds.force_signal(r, axis, evidence.rest(k, place, sds)) for k, r in enumerate(recordings)]
+            for sds in (all_sds, known_sds)
+        )
+        noise = seeds.of_noise(recordings, axis, random)
+        pitches = seeds.pitches_m(recordings, axis, left) + seeds.pitches_m(recordings, axis, unknown, noise)
+        left_driven, unknown_driven, *noise_driven = (
+            seeds.in_step_with_motor(recordings, axis, signals) for signals in (left, unknown, *noise)
+        )
+        driven = seeds.pitches_m(recordings, axis, left_driven)
+        driven += seeds.pitches_m(recordings, axis, unknown_driven, noise_driven)
+        frequencies = seeds.frequencies_hz(recordings, axis, left)
         found += hypotheses.periodic_terms(recordings, axis, pitches, driven, frequencies)
     return found
 

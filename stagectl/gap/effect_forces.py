@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stagectl.effects import CATALOGUE, Effect
+from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import late_readings
 from stagectl.gap.command_path import changed_by
 from stagectl.gap.contact import contact_damping_n_s_per_m
@@ -13,13 +13,15 @@ from stagectl.gap.reading_errors import misread, more_contact_n, reading_error_m
 from stagectl.gap.recording import Recording, contact_of, put_together, relative_motion
 
 
-def known_forces(recording: Recording) -> Forces:
-    """Sum what is believed to act: motors, joint, effects of the profile."""
+def known_forces(recording: Recording, but: Trait | None = None) -> Forces:
+    """Sum what is believed to act: motors, joint, effects of the profile; without those of a trait."""
     total = Forces(recording.felt_n["macro"].copy(), recording.felt_n["end"].copy() if recording.end else None)
     if total.end_n is not None and recording.believed.joint is not None:
         add_forces(total, between(recording, joint_force_n(recording)))
     for row in (*recording.believed.effects, *recording.on_command):
         effect = CATALOGUE[row["name"]]
+        if but in effect.traits:
+            continue
         add_forces(total, effect_forces(recording, effect, row["acts_on"], [row[name] for name in effect.parameters]))
     return total
 
@@ -40,8 +42,9 @@ def _later(recording: Recording, effect: Effect, place: str, parameters: list[fl
     total = Forces()
     for sign, late in ((1.0, (*others, row)), (-1.0, others)):
         there = put_together(
-            recording.log, recording.believed, recording.macro, recording.end, recording.on_command, late
-        )
+            recording.log, recording.believed, recording.macro, recording.end,
+            recording.on_command, late, recording.edges_out_m,
+        )  # fmt: skip
         add_forces(total, scaled_forces(_exchanged(there), sign, Forces()))
     return total
 
@@ -87,7 +90,10 @@ def effect_forces(
         return misread(recording, axis, reading_error_m(recording, effect, place, parameters, whole), whole)
     if place.endswith("_command"):
         return _commanded(recording, axis, effect, parameters)
-    value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
+    if Trait.SWINGS in effect.traits:
+        value = _swung_n(recording, axis, effect, parameters)
+    else:
+        value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
     if place == "contact":
         value = _contact_changed(recording, value, whole)
     if place in ("contact", "joint"):
@@ -99,6 +105,30 @@ def effect_forces(
     if axis == "macro" and "micro_motor_force_n" in effect.quantities:
         value = late_readings.felt_n(recording.late, axis, recording.log, value)
     return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
+
+
+_TINY = 1e-9
+
+
+def _swung_n(recording: Recording, axis: str, effect: Effect, parameters: list[float]) -> np.ndarray:
+    """Return what a share of the mass on a spring does, driven by all other forces that are known, shape (n, parts).
+
+    The acceleration that the past foretells rings already: the share would be driven by itself, by as much of it as a
+    filter has seen so far. A mode of 17.5 Hz and 12 % came out as 17.3 Hz and 10 %, 3700 squares below the noise.
+    In (1 - mu) q'' + 2 zeta w q' + w^2 q = -a_0 the others' a_0 is known. That is the law itself for no share at all,
+    with a_0 / (1 - mu) and with frequency and damping over the root of 1 - mu.
+    """
+    total = known_forces(recording, but=Trait.SWINGS)
+    add_forces(total, recording.found)
+    others_n = total.macro_n if axis == "macro" else total.end_n
+    if others_n is None:
+        raise KeyError(axis)
+    share, frequency_hz, damping = parameters
+    free = np.sqrt(1.0 - share)
+    known = quantities(recording, axis, f"{axis}_force")
+    driven = known | {"acceleration_m_per_s2": others_n / (recording.mass_kg(axis) * (1.0 - share))}
+    arguments = [driven[name] for name in effect.quantities]
+    return share / _TINY * along_motion(effect, arguments, [_TINY, frequency_hz / free, damping / free])
 
 
 def _contact_changed(recording: Recording, pressing_n: np.ndarray, whole: bool) -> np.ndarray:
@@ -148,8 +178,14 @@ def _edges_moved(
     if not whole:
         stiffness = quantities(recording, "end", "contact_edge")["contact_stiffness_n_per_m"]
         return between(recording, -recording.side * value * stiffness)
-    out_m = {}
+    return between(recording, more_contact_n(recording, joint, 0.0, 0.0, *edges_out_m(recording, effect, parameters)))
+
+
+def edges_out_m(recording: Recording, effect: Effect, parameters: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much an effect moves the left and the right edge outward, on parts of intervals."""
+    known = quantities(recording, "end", "contact_edge")
+    out_m = []
     for side in (-1.0, 1.0):
-        known = quantities(recording, "end", "contact_edge") | {"contact_side_ratio": np.full_like(value, side)}
-        out_m[side] = along_motion(effect, [known[name] for name in effect.quantities], parameters)
-    return between(recording, more_contact_n(recording, joint, 0.0, 0.0, out_m[-1.0], out_m[1.0]))
+        sided = known | {"contact_side_ratio": np.full_like(known["contact_side_ratio"], side)}
+        out_m.append(along_motion(effect, [sided[name] for name in effect.quantities], parameters))
+    return out_m[0], out_m[1]

@@ -56,7 +56,7 @@ def grids_for(recordings: Sequence[Recording]) -> Grid:
         "current_loop_lag": [{"time_constant_s": t} for t in (5e-5, 2e-4, 5e-4)],
         "command_delay": [{"delay_s": t} for t in (5e-5, 2e-4, 6e-4)],
         "flexible_mode": [
-            {"share_ratio": 0.02, "frequency_hz": float(f), "damping_ratio": 0.02} for f in np.geomspace(8.0, 200.0, 14)
+            {"share_ratio": 0.02, "frequency_hz": float(f), "damping_ratio": 0.02} for f in np.geomspace(8.0, 200.0, 34)
         ],
         "sensor_delay": [{"delay_s": t} for t in (1e-5, 3e-4)],
         "sensor_lag": [{"time_constant_s": t} for t in (5e-5, 3e-4)],

@@ -5,6 +5,7 @@ then follows from the past. Pure.
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from stagectl.effects import Trait
 from stagectl.gap import balance
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Crew
@@ -43,7 +44,7 @@ def moved_under(
     """
     moving = [group for group in known if moves_readings(first, group) or changes_commands(first, group)]
     still = [group for group in known if group not in moving]
-    explained = first.explained(still)
+    explained, driving = first.explained(still), first.explained(still, but=Trait.SWINGS)
     first.evidence.forget_trials()
     there, moved, kept = settled(
         unsettled,
@@ -53,5 +54,7 @@ def moved_under(
         crew,
     )
     for _ in range(_FORETOLD_PASSES if still else 1):
-        there = crew.here(lambda r: balance.foretold_under(r, sum_of_forces(known_forces(r), explained(r))), there)
+        there = crew.here(
+            lambda r: balance.foretold_under(r, sum_of_forces(known_forces(r), explained(r)), driving(r)), there
+        )
     return KnownMotion(there, moved, kept, explained)

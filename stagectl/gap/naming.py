@@ -178,6 +178,22 @@ def friction_that_drives(named: Sequence[Named], recordings: Sequence[Recording]
     return tuple(found)
 
 
+_OF_ONE_PITCH = ("cogging", "harmonic_cogging")
+
+
+def second_pitches(named: Sequence[Named]) -> tuple[Named, ...]:
+    """Return forces that repeat over a pitch beside a larger one on the same axis: both are one law, of one pitch.
+
+    With two pitches, five amplitudes and phases a force that slows down along the way (periodic in the root of the
+    position) is explained to 2 %.
+    """
+    found = []
+    for place in {one.acts_on for one in named}:
+        repeating = [one for one in named if one.acts_on == place and one.name in _OF_ONE_PITCH]
+        found += sorted(repeating, key=lambda one: -one.gain)[1:]
+    return tuple(found)
+
+
 _WIDTH_CHANGE = "backlash_width_change"
 
 

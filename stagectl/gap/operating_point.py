@@ -9,8 +9,9 @@ from stagectl.effects import Effect
 from stagectl.gap.balance import recording_of
 from stagectl.gap.believed import Believed
 from stagectl.gap.contact import CONTACT_DAMPING
+from stagectl.gap.effect_forces import edges_out_m
 from stagectl.gap.late_readings import makes_late
-from stagectl.gap.quantities import along_motion, in_order, quantities
+from stagectl.gap.quantities import in_order
 from stagectl.gap.reading_errors import reading_error_m
 from stagectl.gap.recording import Recording
 
@@ -33,16 +34,11 @@ def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
     late = tuple(row for row, (effect, *_) in zip(rows, moved, strict=True) if makes_late(effect))
     misreading = [one for one in moved if one[1].endswith("_sensor") and not makes_late(one[0])]
     there = recording
+    left_m = right_m = 0.0
     for effect, place, values in moved:
         if place == "contact_edge" and believed.joint is not None:
-            known = quantities(recording, "end", place)
-            out_m = {}
-            for side in (-1.0, 1.0):
-                sided = known | {"contact_side_ratio": np.full_like(known["contact_side_ratio"], side)}
-                out_m[side] = float(
-                    np.mean(along_motion(effect, [sided[name] for name in effect.quantities], in_order(effect, values)))
-                )
-            believed = _edges_out(believed, out_m[-1.0], out_m[1.0])
+            more_m = edges_out_m(recording, effect, in_order(effect, values))
+            left_m, right_m = left_m + more_m[0], right_m + more_m[1]
     for number in range(_CORRECTIONS if misreading else 1):
         log = raw
         for effect, place, values in misreading:
@@ -53,7 +49,7 @@ def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
             elif log.end_position_m is not None:
                 true_m = _true_m(there, log.end_position_m, effect, place, parameters, number == 0)
                 log = replace(log, end_position_m=true_m)
-        there = recording_of(log, believed, on_command, late)
+        there = recording_of(log, believed, on_command, late, (left_m, right_m))
     return there
 
 

@@ -79,5 +79,8 @@ def more_contact_n(
         raise KeyError("end")
     x_b, x_b_rate = relative_motion(recording)
     damping = contact_damping_n_s_per_m(recording.believed)
-    there = contact_at(recording.believed, joint, x_b + apart_m, x_b_rate + apart_m_per_s, left_out_m, right_out_m)
+    left_m, right_m = recording.edges_out_m
+    there = contact_at(
+        recording.believed, joint, x_b + apart_m, x_b_rate + apart_m_per_s, left_m + left_out_m, right_m + right_out_m
+    )
     return there.push_n(joint, damping) - contact_of(recording).push_n(joint, damping)

@@ -1,6 +1,6 @@
 """One log with all that does not depend on a hypothesis: motion, motor forces, where the joint touches. Pure."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from stagectl.gap import late_readings
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.command_path import delayed, driven
 from stagectl.gap.contact import Contact, contact_at
+from stagectl.gap.forces import Forces
 from stagectl.gap.innovations import Noise
 from stagectl.gap.late_readings import Row
 from stagectl.gap.log import Log
@@ -15,6 +16,9 @@ from stagectl.gap.motion import Motion, motion_of
 
 AXES = ("macro", "end")
 """Bodies; the second one is the micro's, its position the end's."""
+
+EdgesOut = tuple[np.ndarray | float, np.ndarray | float]
+"""By how much effects have moved the left and the right edge outward, on parts of intervals, m: wear goes on."""
 
 
 @dataclass(slots=True)
@@ -38,6 +42,8 @@ class Recording:
     now: dict[str, Motion]  # motion at the samples' own instants
     on_command: tuple[Row, ...] = ()  # effects of the command path that were found, as rows of a profile
     late: tuple[Row, ...] = ()  # effects that make readings those of earlier instants
+    edges_out_m: EdgesOut = (0.0, 0.0)
+    found: Forces = field(default_factory=Forces)  # of effects that were found, of which none is part of the above
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -93,6 +99,7 @@ def put_together(
     end: Motion | None,
     on_command: tuple[Row, ...] = (),
     late: tuple[Row, ...] = (),
+    edges_out_m: EdgesOut = (0.0, 0.0),
 ) -> Recording:
     """Put together what is known along a motion; without one of the end, its own is made of the positions alone."""
     h = log.period_s
@@ -110,13 +117,13 @@ def put_together(
         now["end"] = late_readings.motion_now(late, "end", log, end)
         if believed.joint is not None:
             x_b, x_b_rate = _apart(now["macro"], now["end"])
-            contact = contact_at(believed, believed.joint, x_b, x_b_rate)
+            contact = contact_at(believed, believed.joint, x_b, x_b_rate, *edges_out_m)
             side, depth, depth_rate = contact.side, contact.depth_m, contact.depth_rate_m_per_s
     else:
         end = None
     recording = Recording(
         log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {},
-        felt_n, now, on_command, late,
+        felt_n, now, on_command, late, edges_out_m,
     )  # fmt: skip
     for axis, reported_a in (("macro", log.macro_current_a), ("end", log.micro_current_a)):
         if axis in recording.axes and reported_a is not None and recording.belief(axis).current_noise_a is not None:

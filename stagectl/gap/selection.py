@@ -48,6 +48,10 @@ apart: power 0.9 at 5 % false alarms. Of the likelihoods as they came out (whose
 about it) half of all pairs at that distance would count as one."""
 
 ALIAS_SHARE = 0.002
+"""Of what a name gains, the margin below which two names are one set where recordings lie between what they say."""
+
+BETWEEN_SDS = 3.0
+"""From so many deviations of the noise on, what two names say differently is said by neither."""
 
 LOW_SPEED_SHARE = 0.02
 """Of a machine with more force noise than its sensors explain, no friction is an exact law: at speed, where a velocity
@@ -221,17 +225,23 @@ class Judge:
         """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
         beside = [*self.base, *chosen]
         fold = Fold(beside, self.source.sums, self.source.sums, on_noise=False)
-        best: dict[tuple[str, str], tuple[float, Group]] = {}
+        by_name: dict[tuple[str, str], list[tuple[float, Group]]] = {}
         taken = {group.key for group in chosen}
         open_ones = [group for group in self.library if group.key not in taken]
         for group, at_size in zip(open_ones, self.gains_at_size(beside, open_ones), strict=True):
             gain = max(float(fold.added(group)[0][0]), at_size)
-            worth = gain - self.price() * group.complexity
-            if group.key not in best or worth > best[group.key][0]:
-                best[group.key] = (worth, group)
-        ranked = [group for _, group in sorted(best.values(), key=lambda row: -row[0])]
-        possible = (group for group in ranked[: 4 * most] if self._allowed([*chosen, group]))
-        return self.refine(beside, list(itertools.islice(possible, most)))
+            shapes = by_name.setdefault(group.key, [])
+            shapes.append((gain - self.price() * group.complexity, group))
+            shapes.sort(key=lambda row: -row[0])
+            # at a few sizes only: which of two places is better shows when each has its own
+            del shapes[2 if at_size > 0.0 and not CATALOGUE[group.key[0]].searched else 1 :]
+        ranked = sorted(by_name.values(), key=lambda shapes: -shapes[0][0])
+        possible = (shapes for shapes in ranked[: 4 * most] if self._allowed([*chosen, shapes[0][1]]))
+        found: dict[tuple[str, str], Group] = {}
+        for group in self.refine(beside, [group for shapes in itertools.islice(possible, most) for _, group in shapes]):
+            if group.key not in found or self._worth([*chosen, group]) > self._worth([*chosen, found[group.key]]):
+                found[group.key] = group
+        return list(found.values())
 
     def _note(self, chosen: Sequence[Group], rivals: Sequence[Group]) -> None:
         now = self.gains(chosen)
@@ -340,8 +350,10 @@ class Judge:
             if other.key in taken or _form(other) > _form(group) or not self._allowed([*rest, other]):
                 continue
             margin = with_it - self.gain([*rest, other])
-            too_near = self.distance([*rest, group], [*rest, other]) < ALIAS_GAIN
-            if too_near or margin < self._inexact_share(group, other) * gained:
+            apart = self.distance([*rest, group], [*rest, other])
+            if apart < ALIAS_GAIN or self._is_inexact(
+                group, other, margin / max(gained, 1e-300), _lies_between(margin, apart)
+            ):
                 margins[other.key] = margin
         return sorted(margins.items(), key=lambda row: row[1])
 
@@ -368,11 +380,20 @@ class Judge:
             total += float(apart @ s.gram @ apart)
         return total
 
-    def _inexact_share(self, group: Group, other: Group) -> float:
-        """Return the share of a gain that two laws must differ by to be told apart."""
+    def _is_inexact(self, group: Group, other: Group, share: float, lies_between: bool) -> bool:
+        """Tell whether the share of a gain that two laws differ by may come from laws that are inexact."""
         if self.is_rough and _shows_at_low_speed(group) and _shows_at_low_speed(other):
-            return LOW_SPEED_SHARE
-        return ALIAS_SHARE
+            return share < LOW_SPEED_SHARE
+        return share < ALIAS_SHARE and lies_between
+
+
+def _lies_between(margin: float, apart: float) -> bool:
+    """Tell whether recordings lie between two names, `apart` squares from each other, by more than noise does.
+
+    An exact law beats the other one by their distance, give or take twice its root. What gains less than that is no
+    exact law, and its margin no proof.
+    """
+    return margin < apart - BETWEEN_SDS * 2.0 * float(np.sqrt(max(apart, 0.0)))
 
 
 def _form(group: Group) -> int:

@@ -16,7 +16,13 @@ from stagectl.gap.identifiability import not_separable
 from stagectl.gap.left_over import excess, unknown_rest
 from stagectl.gap.log import Log
 from stagectl.gap.looks import looked_closely
-from stagectl.gap.naming import friction_that_drives, parameter_errors, refitted_errors, without_widths
+from stagectl.gap.naming import (
+    friction_that_drives,
+    parameter_errors,
+    refitted_errors,
+    second_pitches,
+    without_widths,
+)
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import solve
 from stagectl.gap.settling import settled
@@ -103,8 +109,9 @@ def _found(
     look = looked_closely(first, unsettled, noise, without, say, crew)
     solution = solve([*look.search.judge.base, *look.chosen], look.search.evidence.sums)
     named, widths = without_widths(look.named, look.search)
-    driving = {(one.name, one.acts_on) for one in friction_that_drives(named, look.search.evidence.recordings)}
-    possible = [group for group in look.chosen if group.key not in driving]
+    doubtful = (*friction_that_drives(named, look.search.evidence.recordings), *second_pitches(named))
+    gone = {(one.name, one.acts_on) for one in doubtful}
+    possible = [group for group in look.chosen if group.key not in gone]
     unknown = unknown_rest(look.search, possible, excess(first, []))
     if unknown is not None:
         unknown["beside"] = [[effect.name, effect.acts_on] for effect in named]
