@@ -40,7 +40,7 @@ FIELDS = (
 _MEAN_SAMPLES = 10.0
 _FORCE_DEVIATIONS = 3.5  # of a mean of noise: one in two thousand is beyond them
 
-_SETTLING_SAMPLES = 20_000  # well within them the covariance stays what it is
+_SETTLING_SAMPLES = 20_000  # within them the covariance stays what it is where the force noise is below some 0.1 N
 
 
 def init(

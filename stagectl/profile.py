@@ -127,7 +127,7 @@ class Axis(Table):
     thermal_force_n: Force
     thermal_time_constant_s: Annotated[float, within(0.1, 1e5)]
     current_loop_s: Annotated[float, within(1e-6, 0.02)]
-    force_noise_n: Annotated[float, within(0.0, 1e3)] = 0.0  # rms of a cycle, amplifier and jitter of the SYNC
+    force_noise_n: Annotated[float, within(0.0, 10.0)] = 0.0  # rms of a cycle; the observer's gains, and Ms, follow it
     stop: Literal["ramp", "short", "coast"]
 
     @property

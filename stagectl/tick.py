@@ -48,7 +48,8 @@ def estimate(m, e, model, ahead, b, q, p):
         # Left out, lines that always came late left the loop open, and the forces grew to their limits in 100 ms.
         due = int(m.sequence - x.cycle) if m.samples_new > 0 else -1
         x.predicted_samples = periods - due if 0 <= due <= periods else x.predicted_samples + periods
-        if due == 0 or m.samples_new > 1 and m.earlier_sequence == x.cycle:
+        early = int(m.earlier_sequence - x.cycle) if m.samples_new > 1 else -1
+        if due == 0 or early == 0:
             macro_error_m, end_error_m = plant_module.sense(model, q, p, 0.0)
             x.macro_seen_m = (m.macro_position_m if due == 0 else m.macro_earlier_m) - macro_error_m
             x.end_seen_m = (m.end_position_m if due == 0 else m.end_earlier_m) - end_error_m
@@ -65,9 +66,9 @@ def estimate(m, e, model, ahead, b, q, p):
                                  x.macro_word * x.macro_amperes_per_word,
                                  x.micro_word * x.micro_amperes_per_word, 1, 1)
             macro_error_m, end_error_m = plant_module.sense(model, q, p, x.period_s)
-            if k == due - 1:
-                x.macro_seen_m = m.macro_position_m - macro_error_m
-                x.end_seen_m = m.end_position_m - end_error_m
+            if k == due - 1 or k == early - 1:
+                x.macro_seen_m = (m.macro_position_m if k == due - 1 else m.macro_earlier_m) - macro_error_m
+                x.end_seen_m = (m.end_position_m if k == due - 1 else m.end_earlier_m) - end_error_m
                 estimator.correct(x, s, q[0], x.macro_seen_m, x.end_seen_m)
             else:
                 x.macro_seen_m = s.macro_position_m

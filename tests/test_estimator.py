@@ -126,6 +126,27 @@ def test_prediction_of_a_real_machine_drifts_slowly(oled_profile, oled_machine):
     assert 0.5e-9 < max(errors) < 30e-9
 
 
+def test_the_sample_that_waited_through_a_skipped_cycle_corrects_at_its_own_instant(oled_profile, oled_machine):
+    """Both lines lie in the port behind it; the first one, 1 um off, is seen to have been read."""
+    hold, ends_m = np.zeros(1, SETPOINT), []
+    for is_read in (True, False):
+        loop = Loop(simulated(oled_profile, oled_machine, "dsmc"))
+        for _ in range(50):
+            loop.cycle(hold[0])
+        skipped = int(loop.simulation.controller.measurement["cycle"][0]) + 1
+        loop.skip()
+        state = loop.simulation.state[0]
+        waiting = {
+            "samples_new": 2,
+            "earlier_sequence": skipped,
+            "macro_earlier_m": float(state["macro_position_m"]),
+            "end_earlier_m": float(state["end_position_m"]) + 1e-6,
+        }
+        loop.cycle(hold[0], **(waiting if is_read else {}))
+        ends_m.append(float(loop.simulation.controller.model["end_position_m"][0]))
+    assert 0.1e-6 < ends_m[0] - ends_m[1] < 1e-6
+
+
 def test_missed_cycles_are_caught_up(oled_profile, oled_machine):
     """The drives hold their last words while the host sleeps; the observer does as they do."""
     loop = loop_of(oled_profile, oled_machine)
