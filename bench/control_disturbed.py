@@ -16,7 +16,7 @@ from bench import control_limit as limit
 from bench.figure import Bar, Figure, judged
 from bench.following import rms
 from sim_backend.machine import Machine
-from stagectl.adaptive_filter import at_rest, in_motion
+from stagectl.adaptive_filter import at_rest
 from stagectl.budget import lqg
 from stagectl.budget.lqg import Surroundings
 from stagectl.linear_loop import GAP, linearise, machine_body
@@ -187,11 +187,8 @@ def _shaken(hz: float, seeds: Sequence[int]) -> Iterator[Figure]:
 # ---- coarse words, jitter ------------------------------------------------------------------------------------------
 
 
-def least_m(profile: Profile, sensor_noise_m: float, observer: Callable[[np.ndarray], None]) -> float:
-    """Return the best hold at Ms 2.0 of a loop that a force moves no further than the profile's, m.
-
-    `observer` is how that one is: noise that is louder than the profile says keeps it as stiff as a force does.
-    """
+def least_m(profile: Profile, sensor_noise_m: float) -> float:
+    """Return the best hold at Ms 2.0 of a loop that a force moves no further than the profile's at rest, m."""
     axis = profile.axis("micro")
     around = Surroundings(
         mass_kg=axis.mass_kg,
@@ -201,7 +198,7 @@ def least_m(profile: Profile, sensor_noise_m: float, observer: Callable[[np.ndar
         force_noise_n=_FORCE_NOISE_N,
         torque_step_n=axis.torque_step_n,
     )
-    loop = linearise(profile, "dsmc", machine_body(limit.machine(profile)), observer=observer)
+    loop = linearise(profile, "dsmc", machine_body(limit.machine(profile)), observer=at_rest)
     return lqg.optimum(around, 2.0, step_peak_m(loop) / 0.1).true_rms_m
 
 
@@ -209,7 +206,7 @@ def _coarse(seeds: Sequence[int]) -> Iterator[Figure]:
     coarse = limit.with_tables(limit.stage(), micro={"rated_force_n": 180.0, "rated_current_a": 6.0})
     used = list(seeds)
     held_m = max(rms(one.error_m) for one in limit.runs(coarse, "calibrated", np.zeros(_HOLD_ROWS, SETPOINT), seeds))
-    best_m = least_m(coarse, coarse.interferometer.noise_m, at_rest)
+    best_m = least_m(coarse, coarse.interferometer.noise_m)
     yield judged(COARSE, held_m / best_m, used, f"the optimum holds to {1e9 * best_m:.2f} nm")
     yield judged(COARSE_HOLD, 1e9 * held_m, used)
     yield judged(COARSE_PEAK, limit.peak_nm(limit.runs(coarse, "calibrated", limit.trapezoid(), seeds)), used)
@@ -220,7 +217,7 @@ def _jitter(seeds: Sequence[int]) -> Iterator[Figure]:
     for jitter_s in JITTERS_S:
         followed = limit.runs(profile, "calibrated", limit.trapezoid(), seeds, jitter_s=jitter_s)
         at_speed_m = max(rms(one.error_m[_steady(one)]) for one in followed)
-        best_m = least_m(profile, math.hypot(profile.interferometer.noise_m, _SPEED_M_PER_S * jitter_s), in_motion)
+        best_m = least_m(profile, math.hypot(profile.interferometer.noise_m, _SPEED_M_PER_S * jitter_s))
         us = 1e6 * jitter_s
         said = (
             f"{1e9 * at_speed_m:.1f} nm; the optimum for that much noise of the sensor holds to {1e9 * best_m:.1f} nm"
