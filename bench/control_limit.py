@@ -60,6 +60,7 @@ _SETTLED_M = 50e-9
 _STIFFENING_SAMPLES = (2, 4, 6, 8, 10, 12, 16, 24)  # after a force has struck: gains on their way count too
 _STEP_N = 0.1
 _STEP_S = 0.3
+_EARLIEST_DEVIATIONS = 6.0  # no sample jitters to before the SYNC of the sample before
 _SURGE_M_PER_S = 0.02
 """Speed that a reference begins with at once: 40 kg would need an endless force."""
 
@@ -141,7 +142,10 @@ def machines(profile: Profile, kind: str) -> list[Machine]:
 
 
 def run(profile: Profile, one: Machine, setpoints: np.ndarray, seed: int, *, jitter_s: float = 0.0) -> Run:
-    """Rest where the trajectory begins, then follow it; samples are taken `jitter_s` rms beside their instants."""
+    """Rest where the trajectory begins, then follow it; samples are taken `jitter_s` rms beside their instants.
+
+    SYNCs come as much earlier as the samples that do.
+    """
     controller = tick.controller(profile, profile.control.law, has_drives=False)
     simulation = batch.simulation(controller, one, latch_delay_s=profile.cycle.actuation_delay_s, seed=seed)
     at_m = float(setpoints["position_m"][0])
@@ -152,6 +156,7 @@ def run(profile: Profile, one: Machine, setpoints: np.ndarray, seed: int, *, jit
     batch.run(simulation, rest)
     instants_s = batch.instants(simulation, setpoints.size)
     instants_s[1:-1, 0] += np.random.default_rng([seed, 2]).standard_normal(setpoints.size - 1) * jitter_s
+    instants_s[:, 1] -= _EARLIEST_DEVIATIONS * jitter_s
     recording = batch.run(simulation, setpoints, instants_s=instants_s)
     # With jitter the truth is of the instants that came; what the end did is asked at those that were due.
     reference_m = recording.setpoints["position_m"] + recording.setpoints["velocity_m_per_s"] * (

@@ -1,15 +1,17 @@
 """The Kalman filter of the axis that carries the end: as soft as its noise asks at rest, stiff while a force moves it.
 
-    x' = v,  v' = (d + w) / m,  d' = white of density q,   y = x + n at every sample
+    x' = v,  v' = (d + w) / m,  d' = white of density q,   y = x + n + v j at every sample
 
-w is held for a period. Its gains follow from the covariance that it carries along (Kalman 1960; Anderson, Moore,
-Optimal Filtering, chapter 4). q lies between two densities of the profile, by how far the innovations are from noise:
+w is held for a period, j is how far a sample's instant is from the one that it is taken for. Its gains follow from the
+covariance that it carries along (Kalman 1960; Anderson, Moore, Optimal Filtering, chapter 4). q lies between two
+densities of the profile, by how far the innovations are from noise:
 
     q^2 = q_0^2 + u (q_1^2 - q_0^2),  u = min(1, |r / (3.5 sigma_r)|^3)
 
-r is their running mean over ten periods, sigma_r what noise makes of it at rest. (A level of process noise that is
-adjusted: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 11.2.) u is 0
-at rest and 1 where a force moves the end: decision 0027. Inside, positions count in the sensor's noise, times in
+r is their running mean over ten periods, each divided by how much louder than at standstill noise is at its speed
+(decision 0029), sigma_r what noise makes of r at rest. (A level of process noise that is adjusted: Bar-Shalom, Li,
+Kirubarajan, Estimation with Applications to Tracking and Navigation, section 11.2.) u is 0 at rest and 1 where a force
+moves the end: decision 0027. Inside, positions count in the sensor's noise, times in
 periods h, forces in m n / h^2. Pure.
 """
 
@@ -26,6 +28,8 @@ FIELDS = (
     ("filter_walk", "f8"),  # (q_1)^2
     ("filter_rest_walk", "f8"),  # (q_0)^2
     ("filter_held", "f8"),  # w^2
+    ("filter_noise", "f8"),  # n^2 of the sensor: 1
+    ("filter_jitter_s_per_m", "f8"),  # rms of j over the sensor's noise
     ("filter_force_mean_m", "f8"),  # a mean of the innovations that is a force for sure: u = 1
     ("filter_covariance", "f8", (6,)),  # xx, xv, xd, vv, vd, dd behind the last sample
     ("filter_mean_m", "f8"),  # r
@@ -51,6 +55,7 @@ def init(
     drift_n_per_sqrt_s: float,
     rest_drift_ratio: float = 1.0,
     force_noise_n: float = 0.0,
+    jitter_s: float = 0.0,
 ) -> None:
     """Write a filter into a record, shape (1,), settled at rest; q_0 is `rest_drift_ratio` times the drift, q_1."""
     h = period_s
@@ -61,6 +66,8 @@ def init(
     record["filter_walk"] = walk
     record["filter_rest_walk"] = rest_drift_ratio**2 * walk
     record["filter_held"] = (force_noise_n / force_n) ** 2
+    record["filter_noise"] = 1.0
+    record["filter_jitter_s_per_m"] = jitter_s / noise_m
     record["filter_force_mean_m"] = np.inf
     at_rest(record)
     innovation_m = noise_m / np.sqrt(1.0 - float(record["precise_position_gain_ratio"][0]))
@@ -70,6 +77,16 @@ def init(
 def at_rest(record: np.ndarray) -> None:
     """Settle a filter as nothing but noise leaves it, u = 0."""
     _settle(record, 0.0)
+
+
+def at_speed(velocity_m_per_s: float) -> Callable[[np.ndarray], None]:
+    """Return what settles a filter as nothing but noise leaves it at a speed, u = 0, and keeps that noise."""
+
+    def fast(record: np.ndarray) -> None:
+        record["filter_noise"] = 1.0 + (velocity_m_per_s * record["filter_jitter_s_per_m"]) ** 2
+        at_rest(record)
+
+    return fast
 
 
 def in_motion(record: np.ndarray) -> None:
@@ -84,7 +101,7 @@ def stiffening(samples_count: int) -> Callable[[np.ndarray], None]:
         at_rest(record)
         record["least_unrest_ratio"] = 1.0
         for _ in range(samples_count):
-            step(record[0], 0.0)
+            step(record[0], 0.0, 0.0)
 
     return struck
 
@@ -99,7 +116,7 @@ def _settle(record: np.ndarray, unrest_ratio: float) -> None:
 @compiled
 def _stay(e: Record) -> None:
     for _ in range(_SETTLING_SAMPLES):
-        step(e, 0.0)
+        step(e, 0.0, 0.0)
 
 
 def steady_gains(period_s: float, mass_kg: float, noise_m: float, drift_n_per_sqrt_s: float) -> np.ndarray:
@@ -111,9 +128,11 @@ def steady_gains(period_s: float, mass_kg: float, noise_m: float, drift_n_per_sq
 
 
 @compiled
-def step(e: Record, innovation_m: float) -> None:
+def step(e: Record, innovation_m: float, velocity_m_per_s: float) -> None:
     """Take an innovation into the unrest, and bring covariance and gains to the sample that it came with."""
-    e.filter_mean_m += (innovation_m - e.filter_mean_m) / _MEAN_SAMPLES
+    jitter = velocity_m_per_s * e.filter_jitter_s_per_m
+    noise = e.filter_noise + jitter * jitter
+    e.filter_mean_m += (innovation_m / np.sqrt(noise) - e.filter_mean_m) / _MEAN_SAMPLES
     share = abs(e.filter_mean_m / e.filter_force_mean_m)
     e.unrest_ratio = max(share * share * share if share < 1.0 else 1.0, e.least_unrest_ratio)  # nan: 1
     walk = e.filter_rest_walk + e.unrest_ratio * (e.filter_walk - e.filter_rest_walk)
@@ -130,9 +149,9 @@ def step(e: Record, innovation_m: float) -> None:
     vv += held + walk / 3.0
     vd += walk / 2.0
     dd = p[5] + walk
-    to_position = xx / (xx + 1.0)
-    to_velocity = xv / (xx + 1.0)
-    to_force = xd / (xx + 1.0)
+    to_position = xx / (xx + noise)
+    to_velocity = xv / (xx + noise)
+    to_force = xd / (xx + noise)
     p[0] = xx - to_position * xx
     p[1] = xv - to_position * xv
     p[2] = xd - to_position * xd

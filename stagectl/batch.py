@@ -56,6 +56,7 @@ TRUTH = np.dtype(
 )
 """What was true at a sample."""
 
+_SAME_INSTANT_S = 1e-9
 _INTERPOLATION_COUNT = 65536.0  # parts of a count: 16 bits of phase, the uMD2's
 
 _BATCH = '''
@@ -211,8 +212,10 @@ def simulation(controller: Controller, machine: Any, *, latch_delay_s: float, se
 def instants(simulation: Simulation, count: int) -> np.ndarray:
     """Return the instants of the next `count` + 1 samples and of the SYNCs behind them, s, shape (count + 1, 2)."""
     devices = simulation.devices
-    sample_s = (float(devices["sample"][0]) + np.arange(count + 1)) * float(devices["period_s"][0])
-    return np.column_stack([sample_s, sample_s + float(devices["latch_delay_s"][0])])
+    period_s, latch_delay_s = (float(devices[name][0]) for name in ("period_s", "latch_delay_s"))
+    sample_s = (float(devices["sample"][0]) + np.arange(count + 1)) * period_s
+    # A cycle by the host's clock is longer than one by the interferometer's, 20 ppm on the rig.
+    return np.column_stack([sample_s, sample_s + min(latch_delay_s, period_s)])
 
 
 def run(
@@ -224,13 +227,15 @@ def run(
     """Run a cycle a setpoint (SETPOINT array) or until a stop, and return what was recorded.
 
     `late` (bool, one a cycle): where the sample's line comes after its cycle began, so that the next cycle has it.
-    `instants_s`: other instants than `instants`, where the jitter of a wire is to be felt.
+    `instants_s`: other instants than `instants`, where the jitter of a wire is to be felt. RequestError where they are
+    not in order, sample, SYNC, sample: a machine has no way back, and what is jittered backwards would not be felt.
     """
     count = setpoints.size
     if late is None:
         late = np.zeros(count, np.bool_)
     if instants_s is None:
         instants_s = instants(simulation, count)
+    _refuse_disorder(instants_s[: count + 1])
     noise_m = simulation.noise.standard_normal((count, 2)) * simulation.noise_m
     measurements = np.zeros(count, MEASUREMENT)
     commands = np.zeros(count, COMMAND)
@@ -243,3 +248,14 @@ def run(
         c.law, c.guard, c.backlash, c.belief, c.effects, measurements, commands, truth, estimates,
     )  # fmt: skip
     return Recording(measurements[:done], commands[:done], setpoints[:done], truth[:done], estimates[:done])
+
+
+def _refuse_disorder(instants_s: np.ndarray) -> None:
+    steps_s = np.diff(instants_s.ravel()[:-1])
+    if not np.all(steps_s >= -_SAME_INSTANT_S):
+        place = int(np.argmin(steps_s))
+        what = "its SYNC before its sample" if place % 2 == 0 else "the next sample before its SYNC"
+        raise RequestError(
+            f"cycle {place // 2}: {what}, by {-1e6 * steps_s[place]:.3g} us; "
+            "let SYNCs come earlier or samples jitter less"
+        )

@@ -113,7 +113,8 @@ def init(profile: "Profile") -> np.ndarray:
         e["macro_position_gain_ratio"], e["macro_velocity_gain_per_s"], e["macro_force_gain_n_per_m"] = (
             adaptive_filter.steady_gains(period_s, profile.macro.mass_kg, noise_m, control.macro_drift_n_per_sqrt_s)
         )
-    adaptive_filter.init(e, period_s, precise.mass_kg, noise_m, drift, rest_ratio, precise.force_noise_n)
+    jitter_s = profile.interferometer.jitter_s
+    adaptive_filter.init(e, period_s, precise.mass_kg, noise_m, drift, rest_ratio, precise.force_noise_n, jitter_s)
     return e
 
 
@@ -153,13 +154,13 @@ def correct(e: Record, s: Record, q: Record, macro_position_m: float, end_positi
         innovation = end_position_m - s.end_position_m
         e.end_innovation_m = innovation
         innovation = notch.passed(e, innovation)
-        adaptive_filter.step(e, innovation)
+        adaptive_filter.step(e, innovation, s.end_velocity_m_per_s)
         s.end_position_m += e.precise_position_gain_ratio * innovation
         s.end_velocity_m_per_s += e.precise_velocity_gain_per_s * innovation
         s.micro_disturbance_n += e.precise_force_gain_n_per_m * innovation
     else:
         innovation = notch.passed(e, innovation)
-        adaptive_filter.step(e, innovation)
+        adaptive_filter.step(e, innovation, s.macro_velocity_m_per_s)
         s.macro_position_m += e.precise_position_gain_ratio * innovation
         s.macro_velocity_m_per_s += e.precise_velocity_gain_per_s * innovation
         s.macro_disturbance_n += e.precise_force_gain_n_per_m * innovation

@@ -218,6 +218,7 @@ class InterferometerTable(Table):
     port: Annotated[str, Field(pattern=r"^/\S+$")]
     rate_hz: Annotated[float, within(10.0, 100e3)]
     noise_m: Annotated[float, above(0.0, 1e-5)]
+    jitter_s: Annotated[float, within(0.0, 1e-4)] = 0.0  # rms of a sample's instant; at a speed it is noise as well
     transport_s: Annotated[float, within(0.0, 0.1)]  # constant part of the way from sample to readable line
     baud_bit_per_s: Annotated[float, within(9600.0, 12e6)]
     incremental: Flag = True

@@ -10,9 +10,9 @@ PERIOD_S, MASS_KG, NOISE_M, DRIFT, HELD_N = 1e-3, 40.0, 5e-9, 0.05, 5e-3
 RECORD = np.dtype([*one.FIELDS])
 
 
-def made(rest_drift_ratio: float = 0.12, force_noise_n: float = HELD_N) -> np.ndarray:
+def made(rest_drift_ratio: float = 0.12, force_noise_n: float = HELD_N, jitter_s: float = 0.0) -> np.ndarray:
     record = np.zeros(1, RECORD)
-    one.init(record, PERIOD_S, MASS_KG, NOISE_M, DRIFT, rest_drift_ratio, force_noise_n)
+    one.init(record, PERIOD_S, MASS_KG, NOISE_M, DRIFT, rest_drift_ratio, force_noise_n, jitter_s)
     return record
 
 
@@ -21,7 +21,7 @@ def gains(record) -> np.ndarray:
     return np.array([float(record[name][0]) for name in names])
 
 
-def by_scipy(drift_n_per_sqrt_s: float, force_noise_n: float) -> np.ndarray:
+def by_scipy(drift_n_per_sqrt_s: float, force_noise_n: float, noise_m: float = NOISE_M) -> np.ndarray:
     """Solve the filter in SI: the walk by expm (van Loan), the held force by its step."""
     h, m = PERIOD_S, MASS_KG
     rate = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0 / m], [0.0, 0.0, 0.0]])
@@ -31,8 +31,8 @@ def by_scipy(drift_n_per_sqrt_s: float, force_noise_n: float) -> np.ndarray:
     held = np.array([h * h / (2 * m), h / m, 0.0]) * force_noise_n
     noise = step @ both[:3, 3:] + np.outer(held, held)
     seen = np.array([[1.0], [0.0], [0.0]])
-    p = scipy.linalg.solve_discrete_are(step.T, seen, 0.5 * (noise + noise.T), np.array([[NOISE_M**2]]))
-    return p[:, 0] / (p[0, 0] + NOISE_M**2)
+    p = scipy.linalg.solve_discrete_are(step.T, seen, 0.5 * (noise + noise.T), np.array([[noise_m**2]]))
+    return p[:, 0] / (p[0, 0] + noise_m**2)
 
 
 @pytest.mark.parametrize(("state", "ratio"), [(one.at_rest, 0.12), (one.in_motion, 1.0)])
@@ -42,7 +42,7 @@ def test_both_ends_are_kalman_filters_and_stay_where_they_are(state, ratio):
     state(record)
     np.testing.assert_allclose(gains(record), by_scipy(ratio * DRIFT, HELD_N), rtol=1e-4)
     for _ in range(50):
-        one.step(record[0], 0.0)
+        one.step(record[0], 0.0, 0.0)
     np.testing.assert_allclose(gains(record), by_scipy(ratio * DRIFT, HELD_N), rtol=1e-4)
 
 
@@ -50,7 +50,7 @@ def test_without_a_ratio_it_is_one_filter_whatever_it_is_shown():
     record = made(rest_drift_ratio=1.0)
     before = gains(record)
     for innovation_m in (0.0, 1e-6, -1e-3):
-        one.step(record[0], innovation_m)
+        one.step(record[0], innovation_m, 0.0)
     np.testing.assert_allclose(gains(record), before, rtol=1e-9)
     assert record["unrest_ratio"] == 1.0
 
@@ -61,16 +61,16 @@ def test_a_force_stiffens_it_within_thirty_samples_and_noise_does_not():
     noise = np.random.default_rng(5).standard_normal(20000) * NOISE_M * 1.1
     unrest = []
     for innovation_m in noise:
-        one.step(record[0], innovation_m)
+        one.step(record[0], innovation_m, 0.0)
         unrest.append(float(record["unrest_ratio"][0]))
     assert np.mean(unrest) < 0.05
     for innovation_m in noise[:30] + 3.0 * NOISE_M:
-        one.step(record[0], innovation_m)
+        one.step(record[0], innovation_m, 0.0)
     assert record["unrest_ratio"] == 1.0
     np.testing.assert_allclose(gains(record), gains(stiff), rtol=0.02)
     one.at_rest(soft := made())
     for _ in range(300):
-        one.step(record[0], 0.0)
+        one.step(record[0], 0.0, 0.0)
     np.testing.assert_allclose(gains(record), gains(soft), rtol=0.02)
 
 
@@ -89,6 +89,32 @@ def test_what_strikes_at_rest_is_on_its_way_from_soft_to_stiff():
 
 def test_nan_is_no_rest():
     record = made()
-    one.step(record[0], float("nan"))
+    one.step(record[0], float("nan"), 0.0)
     assert record["unrest_ratio"] == 1.0
     assert np.all(np.isfinite(gains(record)))
+
+
+@pytest.mark.parametrize("velocity_m_per_s", [0.2, -0.2, 0.02])
+def test_jitter_is_noise_at_a_speed_and_no_force(velocity_m_per_s):
+    jitter_s = 1e-6
+    noise_m = np.hypot(NOISE_M, velocity_m_per_s * jitter_s)
+    record = made(jitter_s=jitter_s)
+    np.testing.assert_allclose(gains(record), by_scipy(0.12 * DRIFT, HELD_N), rtol=1e-4)  # none at standstill
+    unrest = []
+    for innovation_m in np.random.default_rng(6).standard_normal(5000) * noise_m * 1.1:
+        one.step(record[0], innovation_m, velocity_m_per_s)
+        unrest.append(float(record["unrest_ratio"][0]))
+    assert np.mean(unrest) < 0.05
+    for _ in range(2000):
+        one.step(record[0], 0.0, velocity_m_per_s)
+    np.testing.assert_allclose(gains(record), by_scipy(0.12 * DRIFT, HELD_N, noise_m), rtol=1e-3)
+    one.at_speed(velocity_m_per_s)(settled := made(jitter_s=jitter_s))
+    one.step(settled[0], 0.0, 0.0)  # and stays so where nothing moves: a loop is linearised at rest
+    np.testing.assert_allclose(gains(settled), by_scipy(0.12 * DRIFT, HELD_N, noise_m), rtol=1e-4)
+
+
+def test_a_force_stiffens_it_at_a_speed_too():
+    record = made(jitter_s=1e-6)
+    for _ in range(30):
+        one.step(record[0], 3.0 * 200e-9, 0.2)
+    assert record["unrest_ratio"] == 1.0

@@ -89,3 +89,16 @@ def test_a_scan_counts_windows_at_constant_speed_only():
     average_nm, deviation_nm = scan_nm(made(error_m, speed), 1000.0)
     assert average_nm == pytest.approx(5.3, abs=0.31)
     assert deviation_nm == pytest.approx(3.0, rel=1e-6)
+
+
+def test_jitter_is_felt_whole_and_a_loop_that_was_told_is_quieter():
+    jitter_s, quiet = 1e-6, {}
+    for told_s in (0.0, jitter_s):
+        profile = control_limit.with_tables(stage(), interferometer={"jitter_s": told_s})
+        one = run(profile, machine(profile), trapezoid(), SEED, jitter_s=jitter_s)
+        steady = np.abs(one.setpoints["velocity_m_per_s"]) > 0.2 - 1e-9
+        noise_m = (one.measured_m - one.error_m)[steady]  # v j, and 5 nm
+        assert np.std(noise_m) == pytest.approx(0.2 * jitter_s, rel=0.05)
+        assert abs(np.corrcoef(noise_m, one.error_m[steady])[0, 1]) < 0.05  # no sample is moved by what it sees itself
+        quiet[told_s] = float(np.std(one.error_m[steady]))
+    assert quiet[jitter_s] < 0.5 * quiet[0.0]

@@ -150,6 +150,29 @@ def test_late_lines_cost_little(oled_profile, oled_machine):
     assert 0.8 < errors[0] / errors[1] < 1.5
 
 
+def test_a_sample_before_its_instant_sees_the_stage_where_it_was(oled_profile, oled_machine):
+    simulation = simulated(oled_profile, oled_machine, "dsmc")
+    instants_s = batch.instants(simulation, MOVE.size)
+    k = int(np.argmax(np.abs(MOVE["velocity_m_per_s"])))
+    instants_s[k, 0] -= 20e-6
+    early = batch.run(simulation, MOVE, instants_s=instants_s).truth
+    due = batch.run(simulated(oled_profile, oled_machine, "dsmc"), MOVE).truth
+    moved_m = early["end_position_m"][k] - due["end_position_m"][k]
+    assert moved_m == pytest.approx(-20e-6 * MOVE["velocity_m_per_s"][k], rel=1e-3)
+
+
+@pytest.mark.parametrize(("column", "early_s", "which"), [(0, 0.9e-3, "next sample"), (1, 0.6e-3, "its SYNC")])
+def test_a_machine_has_no_way_back(oled_profile, oled_machine, column, early_s, which):
+    simulation = simulated(oled_profile, oled_machine, "dsmc")
+    instants_s = batch.instants(simulation, MOVE.size)
+    instants_s[7, column] -= early_s
+    with pytest.raises(RequestError, match=rf"cycle [67]: .*{which}"):
+        batch.run(simulation, MOVE, instants_s=instants_s)
+    instants_s[7, column] = np.nan
+    with pytest.raises(RequestError, match="cycle"):
+        batch.run(simulation, MOVE, instants_s=instants_s)
+
+
 def test_position_mode_needs_a_drive(oled_profile, oled_machine):
     with pytest.raises(RequestError, match="position"):
         simulated(with_values(oled_profile, macro__mode="position"), oled_machine, "dsmc")
