@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stagectl.compiled import compiled
 from stagectl.gap.believed import Believed, BelievedJoint
 
 CONTACT_DAMPING = "contact_damping"
@@ -20,8 +21,9 @@ class Contact:
 
     def push_n(self, joint: BelievedJoint, damping_n_s_per_m: float) -> np.ndarray:
         """Force on the end."""
-        stiff_n = side_stiffness_n_per_m(joint, self.side) * self.depth_m
-        return self.side * (stiff_n + damping_n_s_per_m * self.depth_rate_m_per_s)
+        flat = (values.ravel() for values in (self.side, self.depth_m, self.depth_rate_m_per_s))
+        stiffnesses = (joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m)
+        return _pushes_n(*flat, *stiffnesses, damping_n_s_per_m).reshape(self.side.shape)
 
 
 def contact_at(
@@ -36,12 +38,56 @@ def contact_at(
 
     A contact whose damping would pull has let go.
     """
-    right_m, left_m = x_b - joint.right_m - right_out_m, -joint.left_m - left_out_m - x_b
-    side = np.where(right_m > 0.0, 1.0, np.where(left_m > 0.0, -1.0, 0.0))
-    depth = np.where(side > 0.0, right_m, np.where(side < 0.0, left_m, 0.0))
-    overlap = Contact(side, depth, side * x_b_rate)
-    touches = side * overlap.push_n(joint, contact_damping_n_s_per_m(believed)) > 0.0
-    return Contact(side * touches, depth * touches, overlap.depth_rate_m_per_s * touches)
+    shape = x_b.shape
+    edges_m = ((-joint.left_m - left_out_m) + np.zeros(1), (joint.right_m + right_out_m) + np.zeros(1))
+    side, depth_m, rate = _overlaps(
+        x_b.ravel(), x_b_rate.ravel(), *(edge.ravel() for edge in edges_m),
+        joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m, contact_damping_n_s_per_m(believed),
+    )  # fmt: skip
+    return Contact(side.reshape(shape), depth_m.reshape(shape), rate.reshape(shape))
+
+
+@compiled
+def _overlaps(
+    x_b: np.ndarray,
+    x_b_rate: np.ndarray,
+    left_edge_m: np.ndarray,
+    right_edge_m: np.ndarray,
+    left_n_per_m: float,
+    right_n_per_m: float,
+    damping_n_s_per_m: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return side, depth and its rate, shapes (n,); an edge has one place, or one for every x_b."""
+    side, depth_m, rate = np.zeros(x_b.size), np.zeros(x_b.size), np.zeros(x_b.size)
+    for k in range(x_b.size):
+        right_m = x_b[k] - right_edge_m[k if right_edge_m.size > 1 else 0]
+        left_m = left_edge_m[k if left_edge_m.size > 1 else 0] - x_b[k]
+        if right_m > 0.0:
+            towards, deep_m, stiffness = 1.0, right_m, right_n_per_m
+        elif left_m > 0.0:
+            towards, deep_m, stiffness = -1.0, left_m, left_n_per_m
+        else:
+            continue
+        deeper = towards * x_b_rate[k]
+        if stiffness * deep_m + damping_n_s_per_m * deeper > 0.0:
+            side[k], depth_m[k], rate[k] = towards, deep_m, deeper
+    return side, depth_m, rate
+
+
+@compiled
+def _pushes_n(
+    side: np.ndarray,
+    depth_m: np.ndarray,
+    rate: np.ndarray,
+    left_n_per_m: float,
+    right_n_per_m: float,
+    damping_n_s_per_m: float,
+) -> np.ndarray:
+    force_n = np.empty(side.size)
+    for k in range(side.size):
+        stiffness = right_n_per_m if side[k] > 0.0 else left_n_per_m
+        force_n[k] = side[k] * (stiffness * depth_m[k] + damping_n_s_per_m * rate[k])
+    return force_n
 
 
 def contact_damping_n_s_per_m(believed: Believed) -> float:

@@ -6,11 +6,11 @@ from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import late_readings
 from stagectl.gap.command_path import changed_by
 from stagectl.gap.contact import contact_damping_n_s_per_m
-from stagectl.gap.forces import Forces, add_forces, scaled_forces
+from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
 from stagectl.gap.late_readings import makes_late
 from stagectl.gap.quantities import along_motion, quantities
 from stagectl.gap.reading_errors import misread, more_contact_n, reading_error_m
-from stagectl.gap.recording import Recording, contact_of, put_together, relative_motion
+from stagectl.gap.recording import Recording, contact_of, relative_motion, with_late
 
 
 def known_forces(recording: Recording, but: Trait | None = None) -> Forces:
@@ -39,14 +39,10 @@ def _later(recording: Recording, effect: Effect, place: str, parameters: list[fl
     """
     row = {"name": effect.name, "acts_on": place, **dict(zip(effect.parameters, parameters, strict=True))}
     others = tuple(one for one in recording.late if (one["name"], one["acts_on"]) != (effect.name, place))
-    total = Forces()
-    for sign, late in ((1.0, (*others, row)), (-1.0, others)):
-        there = put_together(
-            recording.log, recording.believed, recording.macro, recording.end,
-            recording.on_command, late, recording.edges_out_m,
-        )  # fmt: skip
-        add_forces(total, scaled_forces(_exchanged(there), sign, Forces()))
-    return total
+    key = f"{effect.name}@{place}"
+    if key not in recording.exchanged:
+        recording.exchanged[key] = scaled_forces(_exchanged(with_late(recording, others)), -1.0, Forces())
+    return sum_of_forces(_exchanged(with_late(recording, (*others, row))), recording.exchanged[key])
 
 
 def _exchanged(recording: Recording) -> Forces:

@@ -79,7 +79,7 @@ class Evidence:
     def __getstate__(self) -> dict[str, Any]:
         """Leave behind what another process makes for itself: columns, their sums, quantities along the motion."""
         return {
-            "recordings": [replace(recording, known={}) for recording in self.recordings],
+            "recordings": [replace(recording, known={}, exchanged={}) for recording in self.recordings],
             "channels": [
                 [replace(one, numbers=[INNOVATIONS], rows=one.rows[:1]) for one in channels]
                 for channels in self.channels

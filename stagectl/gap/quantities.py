@@ -33,7 +33,6 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
         "relative_velocity_m_per_s": relative_m_per_s,
         "motor_force_n": motor_n,
         "current_a": motor_n / recording.force_constant_n_per_a(axis),
-        "command_a": recording.held_command_n(axis) / recording.force_constant_n_per_a(axis),
         "micro_motor_force_n": 0.0 * whole if recording.micro_command_n is None else recording.micro_command_n,
         "mass_kg": recording.mass_kg(axis) * whole,
         "t_s": recording.log.start_s

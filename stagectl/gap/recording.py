@@ -1,12 +1,12 @@
 """One log with all that does not depend on a hypothesis: motion, motor forces, where the joint touches. Pure."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from stagectl.gap import late_readings
 from stagectl.gap.believed import Believed, BelievedAxis
-from stagectl.gap.command_path import delayed, driven
+from stagectl.gap.command_path import driven
 from stagectl.gap.contact import Contact, contact_at
 from stagectl.gap.forces import Forces
 from stagectl.gap.innovations import Noise
@@ -44,6 +44,7 @@ class Recording:
     late: tuple[Row, ...] = ()  # effects that make readings those of earlier instants
     edges_out_m: EdgesOut = (0.0, 0.0)
     found: Forces = field(default_factory=Forces)  # of effects that were found, of which none is part of the above
+    exchanged: dict[str, Forces] = field(default_factory=dict)  # without what is late of one sensor, once asked for
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -84,13 +85,6 @@ class Recording:
         """Believed force constant of one motor."""
         return self.belief(axis).force_constant_n_per_a
 
-    def held_command_n(self, axis: str) -> np.ndarray:
-        """Commanded force as the drive holds it, before its current loop, shape (n, parts)."""
-        command_n = self.log.macro_command_n if axis == "macro" else self.log.micro_command_n
-        if command_n is None:
-            return np.zeros_like(self.macro.position_m)
-        return delayed(command_n, self.belief(axis).latch_s / self.log.period_s)
-
 
 def put_together(
     log: Log,
@@ -103,33 +97,48 @@ def put_together(
 ) -> Recording:
     """Put together what is known along a motion; without one of the end, its own is made of the positions alone."""
     h = log.period_s
-    now = {"macro": late_readings.motion_now(late, "macro", log, macro)}
     macro_n, macro_at_n = driven(log.macro_command_n, believed.macro.latch_s, believed.macro.current_loop_s, h)
     at_samples_n = {"macro": macro_at_n}
-    felt_n = {"macro": _felt_n(late, "macro", log, log.macro_command_n, believed.macro, macro_n)}
-    micro_n = depth = depth_rate = side = None
+    micro_n = None
     if log.end_position_m is not None and log.micro_command_n is not None and believed.micro is not None:
         end = end or motion_of(log.end_position_m, h, believed.micro.noise_m)
         micro_n, at_samples_n["end"] = driven(
             log.micro_command_n, believed.micro.latch_s, believed.micro.current_loop_s, h
         )
-        felt_n["end"] = _felt_n(late, "end", log, log.micro_command_n, believed.micro, micro_n)
-        now["end"] = late_readings.motion_now(late, "end", log, end)
-        if believed.joint is not None:
-            x_b, x_b_rate = _apart(now["macro"], now["end"])
-            contact = contact_at(believed, believed.joint, x_b, x_b_rate, *edges_out_m)
-            side, depth, depth_rate = contact.side, contact.depth_m, contact.depth_rate_m_per_s
     else:
         end = None
     recording = Recording(
-        log, believed, macro, end, macro_n, micro_n, depth, depth_rate, side, {}, {}, {}, {},
-        felt_n, now, on_command, late, edges_out_m,
+        log, believed, macro, end, macro_n, micro_n, None, None, None, {}, {}, {}, {}, {}, {}, on_command, late,
+        edges_out_m,
     )  # fmt: skip
+    _read(recording)
     for axis, reported_a in (("macro", log.macro_current_a), ("end", log.micro_current_a)):
         if axis in recording.axes and reported_a is not None and recording.belief(axis).current_noise_a is not None:
             believed_a = at_samples_n[axis] / recording.belief(axis).force_constant_n_per_a
             recording.reported_a[axis] = reported_a - believed_a
     return recording
+
+
+def with_late(recording: Recording, late: tuple[Row, ...]) -> Recording:
+    """Return it with other effects that make readings late; motions and what the motors do stay."""
+    there = replace(recording, late=late, known={}, exchanged={}, felt_n={}, now={})
+    _read(there)
+    return there
+
+
+def _read(recording: Recording) -> None:
+    """Write down what follows from how late readings are: motors as each body feels them, motion now, contact."""
+    log, believed, late = recording.log, recording.believed, recording.late
+    for axis in recording.axes:
+        command_n, motor_n = log.macro_command_n, recording.macro_command_n
+        if axis == "end" and log.micro_command_n is not None and recording.micro_command_n is not None:
+            command_n, motor_n = log.micro_command_n, recording.micro_command_n
+        recording.felt_n[axis] = _felt_n(late, axis, log, command_n, recording.belief(axis), motor_n)
+        recording.now[axis] = late_readings.motion_now(late, axis, log, recording.motion(axis))
+    if recording.end is not None and believed.joint is not None:
+        contact = contact_at(believed, believed.joint, *relative_motion(recording), *recording.edges_out_m)
+        recording.side, recording.penetration_m = contact.side, contact.depth_m
+        recording.penetration_velocity_m_per_s = contact.depth_rate_m_per_s
 
 
 def contact_of(recording: Recording) -> Contact:
@@ -150,8 +159,5 @@ def _felt_n(
 
 def relative_motion(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Return x_b = macro minus end at one instant, on parts of intervals, and its rate."""
-    return _apart(recording.now["macro"], recording.now["end"])
-
-
-def _apart(macro: Motion, end: Motion) -> tuple[np.ndarray, np.ndarray]:
+    macro, end = recording.now["macro"], recording.now["end"]
     return macro.position_m - end.position_m, macro.velocity_m_per_s - end.velocity_m_per_s
