@@ -21,9 +21,11 @@ class Contact:
 
     def push_n(self, joint: BelievedJoint, damping_n_s_per_m: float) -> np.ndarray:
         """Force on the end."""
-        flat = (values.ravel() for values in (self.side, self.depth_m, self.depth_rate_m_per_s))
-        stiffnesses = (joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m)
-        return _pushes_n(*flat, *stiffnesses, damping_n_s_per_m).reshape(self.side.shape)
+        force_n = _pushes_n(
+            self.side.ravel(), self.depth_m.ravel(), self.depth_rate_m_per_s.ravel(),
+            joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m, damping_n_s_per_m,
+        )  # fmt: skip
+        return force_n.reshape(self.side.shape)
 
 
 def contact_at(
@@ -39,9 +41,9 @@ def contact_at(
     A contact whose damping would pull has let go.
     """
     shape = x_b.shape
-    edges_m = ((-joint.left_m - left_out_m) + np.zeros(1), (joint.right_m + right_out_m) + np.zeros(1))
+    left_edge_m, right_edge_m = np.atleast_1d(-joint.left_m - left_out_m), np.atleast_1d(joint.right_m + right_out_m)
     side, depth_m, rate = _overlaps(
-        x_b.ravel(), x_b_rate.ravel(), *(edge.ravel() for edge in edges_m),
+        x_b.ravel(), x_b_rate.ravel(), left_edge_m.ravel(), right_edge_m.ravel(),
         joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m, contact_damping_n_s_per_m(believed),
     )  # fmt: skip
     return Contact(side.reshape(shape), depth_m.reshape(shape), rate.reshape(shape))
