@@ -151,27 +151,25 @@ def servo_killed() -> None:
 
 
 def supervisor_killed() -> None:
-    """The supervisor is killed under a moving stage: the servo stops it, systemd brings the service back."""
-    before = int(unit("NRestarts"))
-    with homing():
-        began_s = time.monotonic()
-        os.kill(int(unit("MainPID")), signal.SIGKILL)
-        stops("supervisor killed", began_s, SERVO_STOPS_S)
-    await_restart("supervisor killed", before)
-    recovers("supervisor killed")
+    """The supervisor is killed while the drive homes: the servo stops the stage, systemd brings the service back."""
+    _without_supervisor("supervisor killed", signal.SIGKILL)
 
 
 def supervisor_hung() -> None:
     """The supervisor hangs while the drive homes: the stage stops, the watchdog ends the service, and it restarts."""
+    _without_supervisor("supervisor hangs", signal.SIGSTOP)
+    said = shell("journalctl", "-u", UNIT, "--no-pager", "-o", "cat")
+    check("supervisor hangs: it was the watchdog", "Watchdog timeout" in said)
+
+
+def _without_supervisor(what: str, number: signal.Signals) -> None:
     before = int(unit("NRestarts"))
     with homing():
         began_s = time.monotonic()
-        os.kill(int(unit("MainPID")), signal.SIGSTOP)
-        stops("supervisor hangs", began_s, SERVO_STOPS_S)
-    await_restart("supervisor hangs", before)
-    said = shell("journalctl", "-u", UNIT, "--no-pager", "-o", "cat")
-    check("supervisor hangs: it was the watchdog", "Watchdog timeout" in said)
-    recovers("supervisor hangs")
+        os.kill(int(unit("MainPID")), number)
+        stops(what, began_s, SERVO_STOPS_S)
+    await_restart(what, before)
+    recovers(what)
 
 
 def out_of_memory() -> None:
