@@ -8,7 +8,7 @@ less sure, *not observable*. Pure; knows no stage and no clock.
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from statistics import median
 
 from stagectl.outcome import BacklashEstimate
@@ -21,6 +21,7 @@ LATELY_S = 10.0
 """Since contact on both sides, as long as the joint counts as observed."""
 
 _SPREAD_SDS = 3.0
+_BACK_RATIO = 0.8  # of a limit: what is less is within it again. At the limit itself noise rang the alarm three times.
 _VALUES = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
 
 
@@ -77,9 +78,24 @@ class WearTracker:
     def __init__(self, limits: WearLimits, last: Look | None = None):
         """Go on from what was published last, where there is any."""
         self._limits = limits
-        self.newest = last
+        self.newest: Look | None = None
+        self._alarm = ""
+        if last is not None:
+            self.go_on_from(last)
         self._looks: deque[Look] = deque(maxlen=LOOKS_COUNT)
         self._touched_s = [-math.inf, -math.inf]  # left, right
+
+    def go_on_from(self, last: Look) -> None:
+        """Take a value as it is."""
+        limits = self._limits
+        if self._alarm:
+            limits = replace(
+                limits,
+                width_change_limit_m=_BACK_RATIO * limits.width_change_limit_m,
+                stiffness_change_limit_ratio=_BACK_RATIO * limits.stiffness_change_limit_ratio,
+            )
+        self.newest = last
+        self._alarm = alarm(last.estimate, self._limits) or (self._alarm if alarm(last.estimate, limits) else "")
 
     def touched(self, t_s: float, left: bool, right: bool) -> None:
         """Note which sides were pressed just now."""
@@ -97,8 +113,9 @@ class WearTracker:
         if not known or estimate.width_m <= 0.0 or (source == PRODUCTION and not self.observable(t_s)):
             self._looks.clear()
             return False
-        self.newest = Look(t_s, estimate, source)
-        self._looks.append(self.newest)
+        look = Look(t_s, estimate, source)
+        self.go_on_from(look)
+        self._looks.append(look)
         return True
 
     def sd_m(self, t_s: float) -> float:
@@ -111,8 +128,8 @@ class WearTracker:
 
     @property
     def alarm(self) -> str:
-        """Say which limit of wear the newest value passes; empty where none."""
-        return "" if self.newest is None else alarm(self.newest.estimate, self._limits)
+        """Say which limit of wear a value passed, until one is well within it again; empty where none did."""
+        return self._alarm
 
     def believable(self) -> BacklashEstimate | None:
         """Return what may be believed from now on: sure, steady over `LOOKS_COUNT` looks, within the limits; or None.

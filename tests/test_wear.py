@@ -85,6 +85,15 @@ def test_wear_beyond_a_limit_is_an_alarm_with_value_and_limit(change, said):
     assert alarm(GOOD, LIMITS) == ""
 
 
+def test_an_alarm_stays_until_a_value_is_well_within_the_limit():
+    tracker = WearTracker(LIMITS)
+    rung = []
+    for change_m in (19e-6, 21e-6, 19e-6, 17e-6, 21e-6, 15e-6, 19e-6):
+        looked(tracker, replace(GOOD, left_m=GOOD.left_m - GOOD.width_m + LIMITS.width_m + change_m))
+        rung.append(bool(tracker.alarm))
+    assert rung == [False, True, True, True, True, False, False]
+
+
 def test_only_what_is_steady_is_believed_and_it_is_the_median():
     steady = [replace(GOOD, left_m=240e-6 + 1e-8 * (i % 3)) for i in range(LOOKS_COUNT)]
     tracker = looked(WearTracker(LIMITS), *steady[:-1])

@@ -62,7 +62,7 @@ class WearWatch:
         unknown = dict.fromkeys(("left_stiffness_sd_n_per_m", "right_stiffness_sd_n_per_m"), math.inf)
         estimate = BacklashEstimate(**values, **unknown, left_sd_m=sd_m, right_sd_m=sd_m)
         age_s = (datetime.now(UTC) - datetime.fromisoformat(last.at)).total_seconds()
-        self._tracker.newest = Look(self._now_s() - max(age_s, 0.0), estimate, IDENTIFIED)
+        self._tracker.go_on_from(Look(self._now_s() - max(age_s, 0.0), estimate, IDENTIFIED))
         self._at = last.at
 
     def observe(self, rows: np.ndarray) -> None:
