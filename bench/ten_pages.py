@@ -1,9 +1,12 @@
 """Ten pages open against none: does the servo miss more cycles? Real processes, windows in turn.
 
 A pair of windows lies close together in time, and which comes first changes, so that what else the host does meets both
-alike. Servo and rig have a processor of their own, as a stage PC gives the servo one: a browser beside them on the same
-processor is a load like any other program. The verdict is Wilcoxon's on the pairs: no bell curve is assumed, a burst
-of misses counts as one pair.
+alike. The servo has a processor of its own, and the kernel's unbound work is kept off it, as isolcpus does on a stage
+PC; supervisor, rig (above all programs, as hardware is), browser and clients share the rest. The verdict is Wilcoxon's
+on the pairs: no bell curve is assumed, a burst of misses counts as one pair.
+
+A third window beside each pair has a load and no client: the same Chromium, drawing a picture of its own that moves. It
+tells what any second program costs from what a client costs, and is judged alike, without a bar.
 """
 
 import asyncio
@@ -18,20 +21,31 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import httpx
+import numpy as np
 import websockets
 
 from bench.figure import Bar, Figure, absent, judged
 from stagectl.errors import StagectlError
-from tests.service.daemon import Daemon
+from stagectl.ring import RingReader
+from tests.service.daemon import Daemon, servo_pid
 
 INCREASE = Bar(
     "missed cycles with ten pages (one Chromium, nine WebSocket clients) against none: increase, lower end of 95 %",
     "1/min",
     0.0,
 )
+INCREASE_LOAD = Bar(
+    "missed cycles with a Chromium that shows no page of ours, against none: lower end of 95 %", "1/min"
+)
+LATE = {
+    "none": Bar("cycles whose line came late, without", "%"),
+    "ten": Bar("cycles whose line came late, with ten pages", "%"),
+    "load": Bar("cycles whose line came late, with a Chromium of another page, no client", "%"),
+}
+WITH_LOAD = Bar("missed cycles with a Chromium of another page, no client", "1/min")
 WITH_PAGES = Bar("missed cycles with ten pages", "1/min")
 WITHOUT_PAGES = Bar("missed cycles without", "1/min")
 
@@ -43,6 +57,21 @@ CLIENTS_COUNT = 9
 _PATIENCE_S = 60.0
 _COMPILE_S = 300.0  # a cold cache on a slow host
 _TRIES_COUNT = 3
+_LOOK_S = 2.0  # the ring holds more than ten seconds
+_KERNEL_WORK = Path("/sys/devices/virtual/workqueue/cpumask")
+_OWN_PICTURE = """data:text/html,<canvas id=c width=1300 height=900></canvas><script>
+const x = c.getContext('2d'); let n = 0;
+function draw() {
+  x.clearRect(0, 0, 1300, 900); n++;
+  for (let k = 0; k < 4; k++) {
+    x.beginPath();
+    for (let i = 0; i < 1300; i++) x.lineTo(i, 450 + 400 * Math.sin(i / 50 + n / 20 + k));
+    x.stroke();
+  }
+  requestAnimationFrame(draw);
+}
+draw();
+</script>"""
 
 
 class Window(NamedTuple):
@@ -53,11 +82,21 @@ class Window(NamedTuple):
     duration_s: float
     held: bool
     """Whether the stage held with power throughout."""
+    late_count: int = 0
+    """Cycles without a line of their own: it came with the next, or was lost."""
 
     @property
     def missed_per_min(self) -> float:
         """Missed cycles a minute."""
         return 60.0 * self.missed_count / self.duration_s
+
+
+class Windows(NamedTuple):
+    """Windows that lie close together in time."""
+
+    none: Window
+    ten: Window
+    load: Window
 
 
 def chromium_path() -> str | None:
@@ -73,29 +112,33 @@ def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
         return
     count, window_s = (PAIRS_FULL, WINDOW_FULL_S) if full else (PAIRS, WINDOW_S)
     with tempfile.TemporaryDirectory(prefix="stagectl-bench-") as name, contextlib.closing(_Stage(Path(name))) as stage:
-        pairs: list[tuple[Window, Window]] = []
+        found: list[Windows] = []
         for number in range(count):
             say(f"ten pages against none: pair {number + 1} of {count}")
-            pairs.append(_pair(stage, window_s, pages_first=number % 2 == 1))
-    yield from figures_of(pairs)
+            found.append(_windows(stage, window_s, number))
+    yield from figures_of(found)
 
 
-def figures_of(pairs: Sequence[tuple[Window, Window]]) -> Iterator[Figure]:
-    """Judge pairs of windows, without pages and with ten."""
-    apart = [ten.missed_per_min - none.missed_per_min for none, ten in pairs]
-    cycles_count = sum(one.cycles_count for pair in pairs for one in pair)
-    held = sum(none.held and ten.held for none, ten in pairs)
-    upper_per_min = -lower_limit([-one for one in apart])
-    remark = (
-        f"{len(pairs)} pairs of windows of {pairs[0][0].duration_s:.0f} s; "
-        f"median increase {median_increase(apart):+.2f}, upper end {upper_per_min:+.2f}; "
-        f"{cycles_count} cycles; power on in {held} pairs"
-    )
-    yield judged(INCREASE, lower_limit(apart), reason=remark)
-    for bar, place in ((WITHOUT_PAGES, 0), (WITH_PAGES, 1)):
-        rates = [pair[place].missed_per_min for pair in pairs]
+def figures_of(found: Sequence[Windows]) -> Iterator[Figure]:
+    """Judge windows with ten pages, and those with another load, by the ones without that lie beside them."""
+    cycles_count = sum(one.cycles_count for windows in found for one in windows)
+    held = sum(all(one.held for one in windows) for windows in found)
+    for bar, kind in ((INCREASE, "ten"), (INCREASE_LOAD, "load")):
+        apart = [getattr(one, kind).missed_per_min - one.none.missed_per_min for one in found]
+        upper_per_min = -lower_limit([-one for one in apart])
+        remark = (
+            f"{len(found)} pairs of windows of {found[0].none.duration_s:.0f} s; "
+            f"median increase {median_increase(apart):+.2f}, upper end {upper_per_min:+.2f}; "
+            f"{cycles_count} cycles; power on in {held} pairs"
+        )
+        yield judged(bar, lower_limit(apart), reason=remark)
+    for bar, kind in ((WITHOUT_PAGES, "none"), (WITH_PAGES, "ten"), (WITH_LOAD, "load")):
+        rates = [getattr(one, kind).missed_per_min for one in found]
         reason = f"mean; windows from {min(rates):.1f} to {max(rates):.1f}"
         yield judged(bar, sum(rates) / len(rates), reason=reason)
+    for kind, bar in LATE.items():
+        chosen: list[Window] = [getattr(one, kind) for one in found]
+        yield judged(bar, 100.0 * sum(one.late_count for one in chosen) / sum(one.cycles_count for one in chosen))
 
 
 def lower_limit(differences: Sequence[float]) -> float:
@@ -136,6 +179,8 @@ def _greatest_rare_sum(count: int) -> int:
 def _lacking() -> str:
     if len(os.sched_getaffinity(0)) < 2:
         return "one processor only: a browser would take the servo's"
+    if not os.access(_KERNEL_WORK, os.W_OK):
+        return f"only root can keep the kernel's own work off the servo's processor ({_KERNEL_WORK})"
     if chromium_path() is None:
         return "no Chromium here: apt install chromium"
     try:
@@ -153,13 +198,20 @@ class _Stage:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self.daemon = Daemon(folder)
-        _await(self._is_idle, "a stage that is connected", _COMPILE_S)
         self._processors = os.sched_getaffinity(0)
-        for pid in _children(self.daemon.process.pid):
+        self._kernel_work = _KERNEL_WORK.read_text()
+        others = self._processors - {max(self._processors)}  # that one is the servo's: the service pins it there
+        _KERNEL_WORK.write_text(f"{sum(1 << processor for processor in others):x}")
+        try:
+            self.daemon = Daemon(folder)
+            _await(self._is_idle, "a stage that is connected", _COMPILE_S)
+        except BaseException:
+            _KERNEL_WORK.write_text(self._kernel_work)
+            raise
+        for pid in {self.daemon.process.pid, *_children(self.daemon.process.pid)} - {servo_pid(self.daemon)}:
             for task in Path(f"/proc/{pid}/task").iterdir():
-                os.sched_setaffinity(int(task.name), {max(self._processors)})
-        os.sched_setaffinity(0, self._processors - {max(self._processors)})  # and what is started from here on
+                os.sched_setaffinity(int(task.name), others)
+        os.sched_setaffinity(0, others)  # and what is started from here on
         self._lease = contextlib.ExitStack()
         self.hold()
 
@@ -171,8 +223,11 @@ class _Stage:
     def close(self) -> None:
         """End the service."""
         os.sched_setaffinity(0, self._processors)
-        self._lease.close()
-        self.daemon.end()
+        try:
+            self._lease.close()
+            self.daemon.end()
+        finally:
+            _KERNEL_WORK.write_text(self._kernel_work)
 
     def hold(self) -> bool:
         """Have the stage hold; a busy host may trip it, so it is tried a few times."""
@@ -193,18 +248,28 @@ class _Stage:
                     client.arm()
         return client.status().state == "armed"
 
+    def _rows(self) -> RingReader:
+        """Attach to the servo's rows, as a second reader: they are only read."""
+        (path,) = Path("/dev/shm").glob(f"stagectl-{self.daemon.process.pid}-*.ring")
+        return RingReader.attach(path)
+
     def window(self, duration_s: float) -> Window:
         """Count for a while."""
         held = self.hold()
         time.sleep(SETTLE_S)
+        rows, late_count = self._rows(), 0
+        rows.read_new()
         before, begin_s = self.daemon.client.status(), time.monotonic()
-        time.sleep(duration_s)
+        while (left_s := begin_s + duration_s - time.monotonic()) > 0.0:
+            time.sleep(min(left_s, _LOOK_S))
+            late_count += int(np.count_nonzero(rows.read_new()["samples_new"] == 0))
         after, end_s = self.daemon.client.status(), time.monotonic()
         return Window(
             after.health.missed_cycles_count - before.health.missed_cycles_count,
             after.health.cycles_count - before.health.cycles_count,
             end_s - begin_s,
             held and before.state == after.state == "armed",
+            late_count,
         )
 
 
@@ -213,11 +278,15 @@ def _children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def _pair(stage: _Stage, window_s: float, pages_first: bool) -> tuple[Window, Window]:
-    none = None if pages_first else stage.window(window_s)
-    with _ten_pages(stage):
-        ten = stage.window(window_s)
-    return (none or stage.window(window_s)), ten
+def _windows(stage: _Stage, window_s: float, number: int) -> Windows:
+    """Count with each of the three, in an order that turns with `number`."""
+    loads = {"none": contextlib.nullcontext, "ten": lambda: _ten_pages(stage), "load": _load}
+    order = list(loads)[number % 3 :] + list(loads)[: number % 3]
+    found: dict[str, Window] = {}
+    for kind in order[::-1] if number % 2 else order:
+        with loads[kind]():
+            found[kind] = stage.window(window_s)
+    return Windows(**found)
 
 
 # ---- ten pages -------------------------------------------------------------------------------------------------------
@@ -281,8 +350,8 @@ class _Listeners:
 
 
 @contextlib.contextmanager
-def _browser(url: str) -> Iterator[None]:
-    """Have a Chromium show the page, and check that it does, before and after."""
+def _shown(url: str) -> Iterator[Any]:
+    """Have a Chromium show something; yields playwright's page."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -291,18 +360,32 @@ def _browser(url: str) -> Iterator[None]:
         try:
             page = browser.new_page(viewport={"width": 1400, "height": 1000})
             page.goto(url)
-
-            def shown_count() -> int:
-                return int(
-                    page.locator("#cycles").inner_text(timeout=1e3 * _PATIENCE_S).replace(",", "").strip("–") or 0
-                )
-
-            _await(lambda: shown_count() > 0, "a Chromium that shows the stage")
-            before = shown_count()
-            yield
-            _await(lambda: shown_count() > before, "a Chromium that still shows it")
+            yield page
         finally:
             browser.close()
+
+
+@contextlib.contextmanager
+def _browser(url: str) -> Iterator[None]:
+    """Have a Chromium show the page, and check that it does, before and after."""
+    with _shown(url) as page:
+
+        def shown_count() -> int:
+            return int(page.locator("#cycles").inner_text(timeout=1e3 * _PATIENCE_S).replace(",", "").strip("–") or 0)
+
+        _await(lambda: shown_count() > 0, "a Chromium that shows the stage")
+        before = shown_count()
+        yield
+        _await(lambda: shown_count() > before, "a Chromium that still shows it")
+
+
+@contextlib.contextmanager
+def _load() -> Iterator[None]:
+    """Have a Chromium draw a picture of its own, that moves, and know of no stage."""
+    with _shown(_OWN_PICTURE) as page:
+        before = page.evaluate("n")
+        yield
+        _await(lambda: page.evaluate("n") > before, "a Chromium that draws")
 
 
 def _await(done: Callable[[], bool], what: str, patience_s: float = _PATIENCE_S) -> None:

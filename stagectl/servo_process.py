@@ -42,6 +42,15 @@ _ORPHAN_S = 2.0
 
 _PRIORITY = 60
 _WARM_CYCLES = 50
+_KERNEL_WORK = Path("/sys/devices/virtual/workqueue/cpumask")
+
+
+def shares_cpu(cpu: int | None, mask: Path = _KERNEL_WORK) -> bool:
+    """Tell whether the kernel's own unbound work may run on this CPU; it hands over what a serial port received."""
+    try:
+        return cpu is None or bool(int(mask.read_text().replace(",", ""), 16) >> cpu & 1)
+    except (OSError, ValueError):
+        return True
 
 
 def make_real_time(cpu: int | None) -> list[str]:
@@ -161,7 +170,8 @@ def _serve(config: dict[str, Any]) -> int:
     ring = RingWriter(ring_path, run_folder=config["run_folder"])
     requests = RequestReader.attach(Path(config["requests"]), REQUEST)
     status = RequestWriter(Path(config["status"]), STATUS)
-    transport = RealtimeTransport(bus, port, names)
+    shared = shares_cpu(config.get("cpu"))
+    transport = RealtimeTransport(bus, port, names, shares_cpu=shared)
     servo = Servo(
         profile,
         WireDecoder(profile, mappings),
@@ -174,6 +184,8 @@ def _serve(config: dict[str, Any]) -> int:
         ring,
     )
     refused = make_real_time(config.get("cpu"))
+    if shared:
+        refused.append(f"a CPU without the kernel's own work ({_KERNEL_WORK})")
     _say({"running": True, "refused": refused, "warnings": port.warnings})
     while port.read():  # lines that waited are old: their arrival says nothing
         pass

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import wilcoxon
 
-from bench.ten_pages import Window, figures_of, lower_limit
+from bench.ten_pages import INCREASE, INCREASE_LOAD, LATE, Window, Windows, figures_of, lower_limit
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -22,15 +22,28 @@ def test_four_pairs_show_nothing():
         lower_limit([1.0, 2.0, 3.0, 4.0])
 
 
-def judged_pairs(increase, bursts=()):
-    """Windows of a minute that miss 3 to 10 cycles, those with pages `increase` more."""
+def judged_windows(increase, bursts=(), load_increase=0):
+    """Windows of a minute that miss 3 to 10 cycles, those with pages or another load so many more; by figure."""
     none = [Window(3 + k, 60_000, 60.0, True) for k in range(8)]
-    ten = [Window(3 + k + increase + (500 if k in bursts else 0), 60_000, 60.0, True) for k in range(8)]
-    return next(figures_of(list(zip(none, ten, strict=True))))
+    ten = [Window(3 + k + increase + (500 if k in bursts else 0), 60_000, 60.0, True, 300) for k in range(8)]
+    load = [Window(3 + k + load_increase, 60_000, 60.0, True) for k in range(8)]
+    return {one.figure: one for one in figures_of([Windows(*each) for each in zip(none, ten, load, strict=True)])}
 
 
 def test_one_more_miss_in_each_window_is_an_increase_and_a_burst_in_one_is_none():
-    assert judged_pairs(1).holds is False
-    assert judged_pairs(0).holds is True
-    assert judged_pairs(-1, bursts=(3,)).holds is True
-    assert judged_pairs(1, bursts=(3,)).holds is False  # nor does it hide one
+    assert judged_windows(1)[INCREASE.figure].holds is False
+    assert judged_windows(0)[INCREASE.figure].holds is True
+    assert judged_windows(-1, bursts=(3,))[INCREASE.figure].holds is True
+    assert judged_windows(1, bursts=(3,))[INCREASE.figure].holds is False  # nor does it hide one
+
+
+def test_a_load_without_a_client_has_a_row_of_its_own_and_excuses_nothing():
+    figures = judged_windows(5, load_increase=5)
+    assert figures[INCREASE.figure].holds is False
+    assert (figures[INCREASE_LOAD.figure].value, figures[INCREASE_LOAD.figure].holds) == (5.0, None)
+
+
+def test_late_lines_are_counted_in_each_kind_of_window():
+    figures = judged_windows(0)
+    assert figures[LATE["ten"].figure].value == 0.5
+    assert figures[LATE["none"].figure].value == 0.0

@@ -1,7 +1,10 @@
 """The servo's world in real time, on a hub and a pseudo-terminal: what is taken, kept, and gone for good."""
 
 import os
+import subprocess
+import sys
 import tty
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +13,7 @@ from drivers.serial_port import SerialPort
 from drivers.transport import CHUNK_LIMIT_BYTES, RealtimeTransport
 from drivers.wire import Inbox
 from sim_backend.hub import Hub
+from stagectl.servo_process import shares_cpu
 
 pytestmark = pytest.mark.real_time
 
@@ -20,13 +24,14 @@ MS = 1_000_000
 class World:
     """A hub and a pty, with a transport on both."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, shares_cpu: bool) -> None:
         self.hub = Hub(path)
         self.master, slave = os.openpty()
         tty.setraw(slave)
         self.port = SerialPort(os.ttyname(slave), 921_600.0)
         os.close(slave)
-        self.transport = RealtimeTransport(open_cyclic("hub", path, [TPDO]), self.port, {TPDO: "macro_tpdo"})
+        bus = open_cyclic("hub", path, [TPDO])
+        self.transport = RealtimeTransport(bus, self.port, {TPDO: "macro_tpdo"}, shares_cpu=shares_cpu)
 
     def serve(self) -> None:
         """Let the hub read what its clients sent."""
@@ -54,9 +59,9 @@ class World:
             os.close(self.master)
 
 
-@pytest.fixture
-def world(tmp_path):
-    made = World(str(tmp_path / "hub"))
+@pytest.fixture(params=[True, False], ids=["cpu-shared", "cpu-alone"])
+def world(tmp_path, request):
+    made = World(str(tmp_path / "hub"), request.param)
     yield made
     made.close()
 
@@ -154,3 +159,67 @@ def test_a_bus_that_is_gone_is_said_when_receiving_and_when_sending(world):
     world.transport.failure = ""
     world.cycle()
     assert "closed" in world.transport.failure or "arm again" in world.transport.failure
+
+
+KERNEL_WORK = Path("/sys/devices/virtual/workqueue/cpumask")
+_BUSY = """
+import os, sys, time
+os.sched_setaffinity(0, {int(sys.argv[1])})
+os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+print("busy", flush=True)
+until_s = time.monotonic() + 0.3
+while time.monotonic() < until_s:
+    pass
+"""
+
+
+@pytest.fixture
+def apart():
+    """Keep the kernel's work on the first processor, and this process on the last; yields the first."""
+    processors = os.sched_getaffinity(0)
+    if len(processors) < 2 or not os.access(KERNEL_WORK, os.W_OK):
+        pytest.skip("needs root and two processors: the kernel's own work is kept on one of them")
+    before = KERNEL_WORK.read_text()
+    KERNEL_WORK.write_text(f"{1 << min(processors):x}")
+    os.sched_setaffinity(0, {max(processors)})
+    yield min(processors)
+    os.sched_setaffinity(0, processors)
+    KERNEL_WORK.write_text(before)
+
+
+def test_a_line_that_the_kernel_has_not_handed_over_yet_holds_no_cycle_up(apart, tmp_path):
+    """What hands it over has the priority of any program, and here it gets no processor for 0.3 s."""
+    world = World(str(tmp_path / "hub"), shares_cpu=False)
+    os.write(world.master, b"first")
+    assert world.cycle().sensor_bytes == b"first"
+    with subprocess.Popen([sys.executable, "-c", _BUSY, str(apart)], stdout=subprocess.PIPE) as busy:
+        assert busy.stdout is not None
+        busy.stdout.readline()
+        os.write(world.master, b"second")
+        begin_t_ns = world.transport.now_t_ns()
+        held_back = [world.cycle().sensor_bytes for _ in range(10)]
+        took_ns = world.transport.now_t_ns() - begin_t_ns
+        assert busy.poll() is None
+    assert held_back == [b""] * 10
+    assert took_ns < 150 * MS  # 30 ms of cycles, and what a test host adds
+    assert world.cycle().sensor_bytes == b"second"
+    world.close()
+
+
+@pytest.mark.parametrize(
+    ("mask", "cpu", "shared"),
+    [
+        ("3", 1, True),
+        ("1", 1, False),
+        ("ffffffff,00000000", 1, False),
+        ("ffffffff,00000000", 33, True),
+        ("3", None, True),
+    ],
+)
+def test_where_the_kernel_may_put_its_own_work_is_read_from_its_mask(tmp_path, mask, cpu, shared):
+    (tmp_path / "cpumask").write_text(mask + "\n")
+    assert shares_cpu(cpu, tmp_path / "cpumask") is shared
+
+
+def test_a_kernel_that_does_not_say_where_it_works_may_work_anywhere(tmp_path):
+    assert shares_cpu(1, tmp_path / "none")
