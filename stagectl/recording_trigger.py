@@ -42,15 +42,21 @@ class TriggerWatch:
         working = np.isin(rows["run_phase"], TICKING)
         if self.trigger.error_m is None and self.trigger.contact_force_n is None:
             return self._reversal(rows["setpoint_velocity_m_per_s"] * working)
+        known = np.ones(rows.size, bool)
         if self.trigger.error_m is not None:
             beyond = np.abs(rows["end_position_m"] - rows["setpoint_position_m"]) > self.trigger.error_m
+            # Behind a late line position and set-point are of different instants: such a row begins and ends nothing.
+            known = ~working | (rows["sequence"] == rows["cycle"]) & (rows["samples_new"] > 0)
         else:
             beyond = np.abs(rows["contact_force_estimate_n"]) > self.trigger.contact_force_n
-        holds = beyond & working
+        places = np.flatnonzero(known)
+        if places.size == 0:
+            return None
+        holds = (beyond & working)[places]
         before = np.concatenate([[self._held], holds[:-1]])
         self._held = bool(holds[-1])
         begins = np.flatnonzero(holds & ~before)
-        return int(begins[0]) if begins.size else None
+        return int(places[begins[0]]) if begins.size else None
 
     def _reversal(self, velocity: np.ndarray) -> int | None:
         moving = np.flatnonzero(velocity)

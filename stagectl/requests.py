@@ -85,7 +85,7 @@ STATUS = np.dtype(
         ("macro_encoder_m", "f8"),
         ("setpoint_position_m", "f8"),
         ("setpoint_relative_position_m", "f8"),
-        ("error_m", "f8"),
+        ("error_m", "f8"),  # of the newest cycle whose own line was there
         ("left_m", "f8"),
         ("right_m", "f8"),
         ("left_stiffness_n_per_m", "f8"),

@@ -116,7 +116,10 @@ def _status_source() -> list[str]:
     lines += ["    r.inputs = m.macro_digital_inputs | m.micro_digital_inputs"]
     lines += ["    r.setpoint_position_m = hold[0].position_m"]
     lines += ["    r.setpoint_relative_position_m = hold[0].relative_position_m"]
-    lines += ["    r.error_m = m.end_position_m - setpoint[0].position_m"]
+    lines += [
+        "    if m.samples_new > 0 and m.sequence == m.cycle:"
+    ]  # behind a late line the position is of another instant
+    lines += ["        r.error_m = m.end_position_m - setpoint[0].position_m"]
     for side in ("left", "right"):
         for name in ("m", "sd_m", "stiffness_n_per_m", "stiffness_sd_n_per_m"):
             lines.append(f"    r.{side}_{name} = b.{side}_{name}")

@@ -133,6 +133,7 @@ class Servo:
         self._homing_id = 0
         self._stated_text = ""
         self._status = np.zeros(1, STATUS)
+        self._status["error_m"] = np.nan  # until a line was there
         self._request_number, request = requests.read()
         self._request = request  # the reader's own copy, the same array for good
         self._asked = fields(request)

@@ -15,6 +15,8 @@ def working(count):
     rows["run_phase"] = int(Phase.TRACKING)
     rows["end_position_m"] = rows["setpoint_position_m"] = rows["setpoint_velocity_m_per_s"] = 0.0
     rows["contact_force_estimate_n"] = 0.0
+    rows["sequence"] = rows["cycle"] = np.arange(count)
+    rows["samples_new"] = 1
     return rows
 
 
@@ -61,3 +63,17 @@ def test_what_holds_from_the_start_or_is_unknown_is_no_event():
     rows = working(10)
     rows["end_position_m"] = rows["contact_force_estimate_n"] = np.nan
     assert found(Trigger(error_m=1e-9), rows) == found(Trigger(contact_force_n=1e-9), rows) == []
+
+
+def test_a_late_line_begins_no_event_and_ends_none():
+    trigger, rows, place = events()[0]
+    late = rows[[50, 51, 130]]
+    late["sequence"] -= 1
+    late["end_position_m"] = [-0.25e-3, -0.25e-3, 0.0]  # the way of a millisecond; and what is no end of it
+    rows[[50, 51, 130]] = late
+    lost = rows[[60, 135]]
+    lost["samples_new"] = 0
+    lost["end_position_m"] = [-0.25e-3, 0.0]
+    rows[[60, 135]] = lost
+    assert found(trigger, rows) == [place]
+    assert found(trigger, rows, range(200)) == [place]
