@@ -90,6 +90,8 @@ class FlightRecorder:
         self._rows_held_count += len(rows)
         while self._rows_held_count - len(self._rows[0]) >= self._kept_count:
             self._rows_held_count -= len(self._rows.popleft())
+        while self._events and self._events[0][2] < self.rows_count - self._rows_held_count:
+            self._events.popleft()  # of rows that are gone
         if self._run is not None:
             with self._policy():
                 self._run.append(rows)

@@ -124,7 +124,8 @@ class Recorder:
         self.manifest = dict(manifest)
         self.rows_count = 0
         self._schema = schema_of(fields)
-        self._pending = np.zeros(BATCH_ROWS_COUNT, ROW)
+        self._pending = np.empty(BATCH_ROWS_COUNT, ROW)
+        self._pending.view(np.uint8).fill(0)  # all of its memory is taken now, not at the first pile of rows
         self._pending_count = 0
         self._first_t_ns: int | None = None
         self._last_t_ns: int | None = None
@@ -175,18 +176,24 @@ class Recorder:
         if self._first_t_ns is None:
             self._first_t_ns = int(rows["t_ns"][0])
         self._last_t_ns = int(rows["t_ns"][-1])
-        end = self._pending_count + count
-        if end > len(self._pending):
-            grown = np.zeros(max(end, 2 * len(self._pending)), ROW)
-            grown[: self._pending_count] = self._pending[: self._pending_count]
-            self._pending = grown
-        # As bytes: numpy copies structured rows field by field, 2 us each.
-        self._pending[self._pending_count : end].view(np.uint8)[:] = np.ascontiguousarray(rows).view(np.uint8)
-        self._pending_count = end
-        self.rows_count += count
-        span_ns = self._last_t_ns - int(self._pending["t_ns"][0])
-        if not 0 <= span_ns < self._batch_ns or end >= BATCH_ROWS_COUNT:
-            self.flush()
+        trouble: RecordError | None = None
+        while len(rows):
+            begin = self._pending_count
+            piece = rows[: BATCH_ROWS_COUNT - begin]
+            end = begin + len(piece)
+            # As bytes: numpy copies structured rows field by field, 2 us each.
+            self._pending[begin:end].view(np.uint8)[:] = np.ascontiguousarray(piece).view(np.uint8)
+            self._pending_count = end
+            self.rows_count += len(piece)
+            rows = rows[len(piece) :]
+            span_ns = int(self._pending["t_ns"][end - 1]) - int(self._pending["t_ns"][0])
+            if not 0 <= span_ns < self._batch_ns or end >= BATCH_ROWS_COUNT:
+                try:
+                    self.flush()
+                except RecordError as error:  # what did not fit is held; the other rows are taken over all the same
+                    trouble = error
+        if trouble is not None:
+            raise trouble
 
     def flush(self) -> None:
         """Write every row and event taken over so far. Errors: RecordError (disk full)."""
@@ -200,6 +207,7 @@ class Recorder:
         self._pending_count = 0
         self._samples.hold(encoded)
         self._write(self._write_held)
+        self._forget_marks()
 
     def event(self, name: str, t_ns: int, row: int | None = None, **fields: Any) -> None:
         """Write one line to events.jsonl; `row` is the row that it precedes (the next one by default)."""
@@ -277,9 +285,13 @@ class Recorder:
                 self._write_held()
             raise RecordError(self._loss_text(error)) from error
 
-    def _loss_text(self, error: OSError) -> str:
+    def _forget_marks(self) -> None:
+        """Keep the ends of pieces that are held, and the one before: a run may go on for months."""
         while len(self._marks) > self._samples.held_count + 1:
             self._marks.popleft()
+
+    def _loss_text(self, error: OSError) -> str:
+        self._forget_marks()
         rows_count, cycle = self._marks[0]
         safe = f"{rows_count} rows, to cycle {cycle}, are safe" if rows_count else "no row is on the disk yet"
         return (

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -655,3 +656,29 @@ while True:
     assert np.array_equal(run.rows["extra_1"], run.rows["cycle"])
     assert recovery.rows_lost_count == 0
     assert len(before.rows) + recovery.rows_count == written_count
+
+
+def test_a_recorder_takes_no_more_memory_as_it_goes_on(tmp_path):
+    """A run may go on for months, and the first pile of rows behind a hiccup of the host may come after hours."""
+    with Recorder(tmp_path / "run", {}) as recorder:
+
+        def record(rows_count: int, first: int) -> int:
+            rows = new_rows(rows_count)
+            rows["t_ns"] = (first + np.arange(rows_count)) * 1_000_000
+            recorder.append(rows)
+            return first + rows_count
+
+        next_row = record(50, 0)
+        tracemalloc.start()
+        try:
+            for _ in range(5):
+                next_row = record(300, next_row)
+            before, _ = tracemalloc.get_traced_memory()
+            next_row = record(5000, next_row)
+            for _ in range(300):
+                next_row = record(300, next_row)
+            assert tracemalloc.get_traced_memory()[0] - before < 10_000
+        finally:
+            tracemalloc.stop()
+    read = read_run(tmp_path / "run")
+    np.testing.assert_array_equal(read.rows["t_ns"], np.arange(next_row) * 1_000_000)

@@ -40,7 +40,7 @@ class Ending(RequestError):
 
 
 class Order:
-    """A command on its way through the service."""
+    """A command on its way through the service; kept as text once it is over, for who asks again."""
 
     def __init__(
         self,
@@ -52,22 +52,39 @@ class Order:
         plan: plans.Plan | None = None,
     ):
         """Wait to be carried out; `plan` is what was planned for it."""
-        self.key, self.name, self.body, self.token = key, name, body, token
+        self.key, self.name, self.token = key, name, token
+        self.body: Any = body
+        """What it asks for; JSON once it was put by."""
         self.plan: Any = None if plan is None else plan.motion
         """What was planned for it, until it is over."""
         self._remark = "" if plan is None else plan.remark
         self._clock_s = clock_s
+        self._message: messages.Command | bytes
         self._message = messages.Command(key=key, name=name, state="waiting", share=0.0, at=now_text())
         self._velocity_m_per_s, self._until_s = 0.0, -math.inf
 
     def message(self) -> messages.Command:
         """Return what there is to say of it; the next change makes a new message."""
-        return self._message
+        message = self._message
+        return messages.Command.model_validate_json(message) if isinstance(message, bytes) else message
+
+    def put_by(self) -> None:
+        """Become small, where nothing more will become of it: a thousand of them are kept."""
+        message = self._message
+        if not isinstance(message, bytes) and self.over:
+            self.body = self.body.model_dump_json().encode()
+            self._message = message.model_dump_json().encode()
+
+    def asks_for(self, name: str, body: Any) -> bool:
+        """Tell whether it is this command."""
+        same = self.body == (body.model_dump_json().encode() if isinstance(self.body, bytes) else body)
+        return self.name == name and same
 
     @property
     def over(self) -> bool:
         """Whether nothing more will become of it."""
-        return self._message.state in ("done", "failed")
+        message = self._message
+        return isinstance(message, bytes) or message.state in ("done", "failed")
 
     def begin(self) -> None:
         """It is being carried out."""
@@ -91,7 +108,7 @@ class Order:
         self._change(state="failed", text=str(error), error=failure)
 
     def _change(self, **changes: Any) -> None:
-        self._message = self._message.model_copy(update=changes)
+        self._message = self.message().model_copy(update=changes)
 
     def hold(self, velocity_m_per_s: float, hold_s: float) -> None:
         """Have a jog go on at this velocity for so long."""
@@ -349,7 +366,7 @@ class Desk:
         with self._lock:
             known = self._orders.get(key)
             if known is not None:
-                if known.name != name or known.body != body:
+                if not known.asks_for(name, body):
                     raise Unfit(f"key {key!r} was used for another {known.name}; take a new key for a new command")
                 return known.message()
             self._refuse_when_closed()
@@ -390,6 +407,8 @@ class Desk:
         return None if order is None else order.message()
 
     def _keep_order(self, order: Order) -> None:
+        if self._current is not None:
+            self._current.put_by()
         self._orders[order.key] = self._current = self._waiting = order
         while len(self._orders) > _KEPT_ORDERS_COUNT:
             self._orders.popitem(last=False)
