@@ -156,6 +156,8 @@ class RealtimeTransport:
             self._told.clear()
             return
         self._more = len(data) == READ_BYTES  # an arrival is told once
+        if not data:
+            return
         room = CHUNK_LIMIT_BYTES - len(inbox.sensor_bytes)
         inbox.add_sensor_bytes(data[:room], arrival_t_ns)
         self._kept = data[room:]

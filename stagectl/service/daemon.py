@@ -1,5 +1,6 @@
 """`stagectl serve`: the parts put together. The main thread is the stage's, a second one answers clients."""
 
+import gc
 import signal
 from dataclasses import replace
 from importlib import metadata
@@ -52,6 +53,7 @@ def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
     hear_signals(loop)
     listener = Listener(sockets)
     listener.start()
+    keep_for_good()
     notifier.say(READY=1, STATUS="listening")
     try:
         loop.run()
@@ -59,6 +61,17 @@ def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
         listener.close()
         socket_path.unlink(missing_ok=True)
         log.say("ended")
+
+
+def keep_for_good() -> None:
+    """Take what is here now out of all later collections.
+
+    A whole collection waits for a quarter more objects than the last one left. With 120,000 of the libraries among them
+    that was minutes of what requests leave in circles: 1.5 MB up and down.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.collect()
 
 
 def hear_signals(loop: StageLoop) -> None:
