@@ -40,6 +40,7 @@ _NMT_NAMES = {
 EMERGENCY_LOG_LENGTH = 256
 _ANSWER_S = 1.0  # of an SDO; canopen's 0.3 s is too short for a host that does something else
 _LACKING_SHOWN = 8  # of the objects that an EDS file lacks: more would bury the sentence
+_NAMES_ITS_OBJECT = (0x40, 0x60, 0x80)  # answers to an upload's and a download's begin, abort (CiA 301, 7.2.4.3)
 RECEIVER_PERIOD_S = 0.1  # the receiver thread notices a close after this
 
 # Its aborts and timeouts come back as our exceptions; the same text on stderr would be noise.
@@ -84,6 +85,8 @@ class Master:
         self._clock_s = clock_s
         self.pause = pause
         self._sdo_lock = threading.Lock()  # canopen's SDO client has none
+        self._asked: tuple[int, bytes] | None = None  # the object of the SDO under way: node id, index and subindex
+        self._given_up: set[tuple[int, bytes]] = set()  # objects whose answer was not waited for to the end
         self._subscribers_lock = threading.Lock()  # nor has its table of subscribers
         self._heartbeat_t_s: dict[int, float] = {}
         self._nmt_state: dict[int, int] = {}
@@ -112,17 +115,19 @@ class Master:
         if node_id in self._nodes:
             return
         node = canopen.RemoteNode(node_id, _dictionary(node_id, eds_path))
+        # A reply that isn't there when `send` returns never comes: nobody else moves virtual time.
+        node.sdo.RESPONSE_TIMEOUT = 0.0 if self._synchronous else _ANSWER_S
+        self._nodes[node_id] = node
         with self._subscribers_lock:
             self.network.add_node(node)
             # canopen's consumers keep every emergency for good, and raise on frames of an unexpected length.
             self.network.unsubscribe(0x080 + node_id, node.emcy.on_emcy)
             self.network.unsubscribe(0x700 + node_id, node.nmt.on_heartbeat)
             self.network.unsubscribe(0x000, node.nmt.on_command)
+            self.network.unsubscribe(0x580 + node_id, node.sdo.on_response)
+            self.network.subscribe(0x580 + node_id, self._on_answer)
             self.network.subscribe(0x080 + node_id, self._on_emergency)
             self.network.subscribe(0x700 + node_id, self._on_heartbeat)
-        # A reply that isn't there when `send` returns never comes: nobody else moves virtual time.
-        node.sdo.RESPONSE_TIMEOUT = 0.0 if self._synchronous else _ANSWER_S
-        self._nodes[node_id] = node
 
     def nmt(self, node_id: int, command: int | str) -> None:
         """Send an NMT command, a code or a name ("start", "stop", "pre-operational", "reset-node",
@@ -140,10 +145,13 @@ class Master:
         """Return the indices of all objects in the node's EDS file."""
         return list(self._node(node_id).object_dictionary)
 
-    def read(self, node_id: int, index: int, subindex: int = 0) -> int:
-        """Read an integer object; DriveError with the abort's text, LinkError where nobody answers."""
+    def read(self, node_id: int, index: int, subindex: int = 0, *, answer_s: float | None = None) -> int:
+        """Read an integer object; DriveError with the abort's text, LinkError where nobody answers.
+
+        `answer_s`: wait no longer for another SDO's end and no longer for the answer (in virtual time neither waits).
+        """
         signed, _ = self._integer_type(node_id, index, subindex)
-        data = self._transfer(node_id, index, subindex, None)
+        data = self._transfer(node_id, index, subindex, None, answer_s)
         if not data:
             raise DriveError(f"{_place(node_id, index, subindex)}: the drive answered without a value; check its EDS")
         return int.from_bytes(data, "little", signed=signed)
@@ -216,26 +224,49 @@ class Master:
             )
         return variable.data_type in datatypes.SIGNED_TYPES, len(variable) // 8
 
-    def _transfer(self, node_id: int, index: int, subindex: int, data: bytes | None) -> bytes:
+    def _transfer(
+        self, node_id: int, index: int, subindex: int, data: bytes | None, answer_s: float | None = None
+    ) -> bytes:
         """Upload (data None) or download; one at a time."""
         client = self._node(node_id).sdo
         place = _place(node_id, index, subindex)
         self._check_receiver()
-        with self._sdo_lock:
-            try:
-                if data is None:
-                    return client.upload(index, subindex)
-                client.download(index, subindex, data)
-            except SdoAbortedError as error:
-                verb = "read" if data is None else f"write of {data.hex(' ')}"
-                raise DriveError(f"{place}: the drive refused the {verb}: {error}") from error
-            except SdoCommunicationError as error:
-                raise LinkError(
-                    f"{place}: {error}; check the drive's power, node id and bit rate, and the cable's termination"
-                ) from error
-            except (can.CanError, OSError) as error:
-                raise LinkError(f"{place}: {error}; check the adapter and its cable") from error
+        if not self._sdo_lock.acquire(timeout=-1 if answer_s is None else answer_s):
+            raise LinkError(f"{place}: another SDO is under way for more than {answer_s:g} s; check the drives")
+        asked = self._asked = (node_id, index.to_bytes(2, "little") + bytes((subindex,)))
+        patience_s = client.RESPONSE_TIMEOUT
+        try:
+            if answer_s is not None and not self._synchronous:
+                client.RESPONSE_TIMEOUT = answer_s
+            if data is None:
+                return client.upload(index, subindex)
+            client.download(index, subindex, data)
+        except SdoAbortedError as error:
+            verb = "read" if data is None else f"write of {data.hex(' ')}"
+            raise DriveError(f"{place}: the drive refused the {verb}: {error}") from error
+        except SdoCommunicationError as error:
+            if answer_s is not None:
+                self._given_up.add(asked)
+            raise LinkError(
+                f"{place}: {error}; check the drive's power, node id and bit rate, and the cable's termination"
+            ) from error
+        except (can.CanError, OSError) as error:
+            raise LinkError(f"{place}: {error}; check the adapter and its cable") from error
+        finally:
+            client.RESPONSE_TIMEOUT = patience_s
+            self._sdo_lock.release()
         return b""
+
+    def _on_answer(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        """Hand an SDO answer on, but for one that comes after it was given up: the next SDO would take it for its own.
+
+        canopen's client takes whatever comes first, and fails where that names another object.
+        """
+        node_id = can_id - 0x580
+        of = (node_id, bytes(data[1:4]))
+        if of in self._given_up and of != self._asked and data[0] & 0xE0 in _NAMES_ITS_OBJECT:
+            return  # `of` has an index: the frame is not empty
+        self._nodes[node_id].sdo.on_response(can_id, data, timestamp)
 
     def _guarded_send(self, can_id: int, payload: bytes) -> None:
         try:

@@ -8,11 +8,12 @@ import math
 from collections.abc import MutableMapping
 from typing import Any
 
-from sim_backend import drive_servo
+from sim_backend import drive_servo, winding
 from sim_backend.drive_states import FAULT_RESET_BIT, STATUSWORD, DriveState, Order, next_state, order_of
 from sim_backend.object_dictionary import key
 
 ERROR_REGISTER = key(0x1001)
+WINDING_TEMPERATURE = key(0x2010)
 ABORT_CONNECTION_OPTION = key(0x6007)
 ERROR_CODE = key(0x603F)
 CONTROLWORD = key(0x6040)
@@ -82,15 +83,20 @@ _SHORTED_REST_A = 5e-3
 
 _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE)
 _WORD_LIMIT = 32767
+_COUNTS_PER_DEGC = 10.0  # of WINDING_TEMPERATURE, as the EDS files' comments say
 
 
 class Drive:
     """One drive; `objects` is its object dictionary as integers, shared with its node."""
 
-    def __init__(self, axis: Any, objects: MutableMapping[int, int], position_m: float) -> None:
+    def __init__(
+        self, axis: Any, objects: MutableMapping[int, int], position_m: float, ambient_degc: float = 20.0
+    ) -> None:
         self.objects = objects
         self.servo_parameters = drive_servo.parameters(axis)
         self.servo = drive_servo.init(self.servo_parameters, position_m)
+        self.winding_parameters = winding.parameters(axis, ambient_degc)
+        self.winding = winding.init()
         self._limited = self.servo["limited"]  # views: a field by name costs 100 ns
         self._torque_target_a = self.servo["torque_target_a"]
         self.has_encoder = bool(self.servo_parameters["has_encoder"][0])
@@ -410,6 +416,11 @@ class Drive:
         word = round(current_a / self._ampere_per_word)
         objects[TORQUE] = min(max(word, -_WORD_LIMIT), _WORD_LIMIT)
         objects[STATUS] = self.statusword()
+
+    def sample_temperature(self) -> None:
+        """Put the winding's temperature of this instant into its object."""
+        word = round(_COUNTS_PER_DEGC * winding.temperature_degc(self.winding, self.winding_parameters))
+        self.objects[WINDING_TEMPERATURE] = min(max(word, -_WORD_LIMIT), _WORD_LIMIT)
 
     def statusword(self) -> int:
         """Return 0x6041 of the present state and mode."""

@@ -25,6 +25,13 @@ Damping = Annotated[float, within(0.0, 1e7)]
 NodeId = Annotated[int, whole(1, 127)]
 
 
+class Winding(Table):
+    """How warm its current makes a motor's winding; first order, above the air's temperature."""
+
+    rise_at_rated_current_k: Annotated[float, within(0.0, 1e3)]
+    time_constant_s: Annotated[float, within(0.1, 1e5)]
+
+
 class Motor(Table):
     """A motor with its drive, as far as both axes are alike."""
 
@@ -40,6 +47,7 @@ class Motor(Table):
     current_loop_s: Annotated[float, within(1e-6, 0.02)]
     force_noise_n: Annotated[float, within(0.0, 1e3)] = 0.0  # rms, held for a millisecond
     has_rpdo_deadline: bool = True  # false = the drive lacks 0x1400:05, as many do
+    winding: Winding | None = None  # None = the drive has no 0x2010, the winding's temperature
     stop_stiffness_n_per_m: Stiffness
     stop_damping_n_s_per_m: Damping
 

@@ -189,6 +189,9 @@ class DriveNode:
         if object_key in _PROCESS_KEYS:
             self.drive.sample(self._position_m, self._current_a)
             return self.objects[object_key]
+        if object_key == cia402.WINDING_TEMPERATURE:
+            self.drive.sample_temperature()
+            return self.objects[object_key]
         return None
 
     def _on_write(self, index: int, subindex: int, od: Any, data: bytes) -> None:

@@ -26,7 +26,8 @@ def load(path: str | Path, node_id: int, axis: Any) -> canopen.ObjectDictionary:
     """Read an EDS file and make it a rig drive's: vendor id, name plate of its motor, encoder step.
 
     `axis` is a [macro] or [micro] table; `rated_force_n` (the name plate, not the true constant) may be missing:
-    then the EDS file's 0x6076 stands. Without `has_rpdo_deadline` the drive lacks 0x1400:05 that its EDS file has.
+    then the EDS file's 0x6076 stands. Without `has_rpdo_deadline` the drive lacks 0x1400:05 that its EDS file has,
+    without `winding` the temperature of one, 0x2010.
     """
     if not Path(path).is_file():
         raise ProfileError(f"{path}: the rig's EDS file is missing; give the path of an existing EDS file")
@@ -45,6 +46,8 @@ def load(path: str | Path, node_id: int, axis: Any) -> canopen.ObjectDictionary:
         communication = dictionary[0x1400]
         if isinstance(communication, ODRecord):
             del communication[5]
+    if getattr(axis, "winding", None) is None and 0x2010 in dictionary:
+        del dictionary[0x2010]
     return dictionary
 
 

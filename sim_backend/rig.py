@@ -25,13 +25,27 @@ SUBSTEP_S = 50e-6  # the longest
 _ADVANCE = '''"""Generated: plant and drives of one machine, advanced together."""
 import numpy as np
 
-from sim_backend import drive_servo
+from sim_backend import drive_servo, winding
 from stagectl.compiled import compiled
 from {plant_module} import substep
 
 
 @compiled
-def advance(state, parameters, effect_parameters, macro, macro_parameters, micro, micro_parameters, until_s, longest_s):
+def advance(
+    state,
+    parameters,
+    effect_parameters,
+    macro,
+    macro_parameters,
+    micro,
+    micro_parameters,
+    macro_winding,
+    macro_winding_parameters,
+    micro_winding,
+    micro_winding_parameters,
+    until_s,
+    longest_s,
+):
     """Advance to `until_s` in equal substeps of at most `longest_s`; each begins with the drives' servo steps."""
     s = state[0]
     span_s = until_s - s.t_s
@@ -53,6 +67,9 @@ def advance(state, parameters, effect_parameters, macro, macro_parameters, micro
             macro[0].bridge,
             micro[0].bridge,
         )
+        winding.step(macro_winding, macro_winding_parameters, s.macro_current_a, dt_s)
+        if parameters[0].has_micro != 0.0:
+            winding.step(micro_winding, micro_winding_parameters, s.micro_current_a, dt_s)
     s.t_s = until_s
 '''
 
@@ -104,6 +121,10 @@ class Rig:
             self._macro_drive.servo_parameters,
             self._micro_drive.servo,
             self._micro_drive.servo_parameters,
+            self._macro_drive.winding,
+            self._macro_drive.winding_parameters,
+            self._micro_drive.winding,
+            self._micro_drive.winding_parameters,
         )
         self._advance = direct(rig_module.advance, *self._arrays, 0.0, SUBSTEP_S)
         self.interferometer = Interferometer(machine, seed, start_t_ns, macro_m, end_m)
@@ -139,7 +160,10 @@ class Rig:
     def _node(self, axis: Any, name: str, position_m: float) -> DriveNode:
         path = self.machine.eds_path(name)
         dictionary = object_dictionary.load(path, axis.node_id, axis)
-        return DriveNode(axis.node_id, dictionary, lambda objects: Drive(axis, objects, position_m), self.start_t_ns)
+        ambient_degc = self.machine.air.temperature_degc
+        return DriveNode(
+            axis.node_id, dictionary, lambda objects: Drive(axis, objects, position_m, ambient_degc), self.start_t_ns
+        )
 
     # -- state --------------------------------------------------------------------------------------------------------
 

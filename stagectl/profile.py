@@ -113,6 +113,17 @@ class Homing(Table):
     timeout_s: Annotated[float, within(1.0, 3600.0)]
 
 
+class Temperature(Table):
+    """The drive's object that holds a temperature, of winding or power stage: each vendor has its own."""
+
+    index: Annotated[int, whole(0x2000, 0x9FFF)]
+    subindex: Annotated[int, whole(0, 254)] = 0
+    degc_per_count: Annotated[float, above(0.0, 10.0)]
+    warning_degc: Annotated[float, within(-40.0, 300.0)] | None = (
+        None  # said, and nothing else: the drive protects itself
+    )
+
+
 class Axis(Table):
     """A drive and its motor, as far as both axes are alike."""
 
@@ -129,6 +140,7 @@ class Axis(Table):
     current_loop_s: Annotated[float, within(1e-6, 0.02)]
     force_noise_n: Annotated[float, within(0.0, 10.0)] = 0.0  # rms of a cycle; the observer's gains, and Ms, follow it
     stop: Literal["ramp", "short", "coast"]
+    temperature: Temperature | None = None
 
     @property
     def torque_step_n(self) -> float:

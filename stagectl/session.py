@@ -5,6 +5,7 @@ Everything that moves is asked for through it (`stagectl.motion`, `stagectl.homi
 
 import contextlib
 import math
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
@@ -22,17 +23,19 @@ from stagectl.flight_recorder import FlightRecorder
 from stagectl.heartbeats import Heartbeats
 from stagectl.outcome import BacklashEstimate, Outcome
 from stagectl.plant import PLANT_PARAMETERS
-from stagectl.profile import AxisName, Profile
+from stagectl.profile import AxisName, Profile, Temperature
 from stagectl.record import Recorder
 from stagectl.replay import describe_mapping
 from stagectl.requests import RESTING, Mode, Phase
 from stagectl.signals import STOP_TEXT, Stop, stop_sentence
+from stagectl.temperatures import DriveTemperature, News, Temperatures, answer_s
 from stagectl.tracker import LAW_NAMES
 from stagectl.undisturbed import undisturbed
 
 _STEP_S = 0.02
 _SENSOR_TIMEOUT_S = 5.0
 _RESET_TIMEOUT_S = 2.0
+_NEWS_KEPT_COUNT = 100
 _FAULTS = (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE)
 
 _WITH_POWER = (int(Mode.TRACK), int(Mode.HOME_DRIVE))
@@ -80,6 +83,10 @@ class Session:
         self._watches = False
         self._asked_to_stop = False
         self._heartbeats = Heartbeats(profile.trip.heartbeat_s)
+        axes = ((axis, profile.axis(axis).temperature) for axis in profile.axes)
+        tables = {axis: table for axis, table in axes if table is not None}
+        self._temperatures = Temperatures(tables, self._temperature_count)
+        self._news: deque[News] = deque(maxlen=_NEWS_KEPT_COUNT)
         self._reason = ""  # why this side asked the servo to stop
         self._trouble: StagectlError | None = None  # raised as soon as the stage rests
         self.mappings: dict[str, DriveMapping] = {}
@@ -191,6 +198,30 @@ class Session:
             self._event("heartbeat_lost", axis=axis, node_id=self._node_ids[axis], age_s=ages_s[axis])
         if self._heartbeats.missing:
             self._distress(Stop.HEARTBEAT_LOST, self._heartbeats.detail(self._node_ids))
+        for news in self._temperatures.look(self._now_s, self._heartbeats.missing):
+            self._event(news.event, text=news.text, **news.fields)
+            self._news.append(news)
+
+    def _temperature_count(self, axis: AxisName, table: Temperature) -> int:
+        """Read a drive's temperature; no longer than the servo may go without hearing of this side."""
+        node_id = self.mappings[axis].node_id
+        return self.master.read(node_id, table.index, table.subindex, answer_s=answer_s(self.profile.trip))
+
+    @property
+    def _now_s(self) -> float:
+        return 1e-9 * self.link.now_t_ns()
+
+    @property
+    def temperatures(self) -> dict[AxisName, tuple[DriveTemperature, float]]:
+        """What the drives said of their temperatures last, by axis, and how long ago, s."""
+        now_s = self._now_s
+        return {axis: (found, now_s - found.t_s) for axis, found in self._temperatures.newest.items()}
+
+    def take_news(self) -> list[News]:
+        """Return what happened to temperatures since the last call, oldest first; the run's events have it, too."""
+        taken = list(self._news)
+        self._news.clear()
+        return taken
 
     @property
     def _node_ids(self) -> dict[str, int]:

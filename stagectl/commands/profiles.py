@@ -52,6 +52,8 @@ def check_eds(profile: Profile) -> None:
     for name in profile.axes:
         axis, is_macro = profile.axis(name), name == "macro"
         objects = needed_objects(profile.macro.mode if is_macro else "torque", homes=is_macro)
+        if axis.temperature is not None:
+            objects.append((axis.temperature.index, axis.temperature.subindex))
         identity = (axis.identity.vendor_id, axis.identity.product_code)
         problem = eds_problem(profile.eds_path(name), axis.node_id, identity, objects)
         if problem:

@@ -221,12 +221,19 @@ def status_table(found: messages.Status) -> Table:
     health = found.health
     late = "" if health.lateness_p99_s is None else f", 99 % within {health.lateness_p99_s * 1e6:.0f} us"
     table.add_row("[dim]cycles[/]", f"{health.cycles_count}, {health.missed_cycles_count} missed{late}")
+    if found.temperatures:
+        table.add_row("[dim]drives[/]", ", ".join(_temperature(axis, one) for axis, one in found.temperatures.items()))
     if found.recording is not None:
         run = found.recording.run or "flight recorder only"
         table.add_row("[dim]recording[/]", escape(f"{run} {found.recording.trouble}".strip()))
     for remark in found.remarks:
         table.add_row("[dim]remark[/]", f"[yellow]{escape(remark)}[/]")
     return table
+
+
+def _temperature(axis: str, one: messages.Temperature) -> str:
+    text = f"{axis} {one.degc:.1f} degC"
+    return f"[yellow]{text}, above its warning[/]" if one.warning else text
 
 
 def log(voice: Voice, socket: Path | None, lines_count: int) -> Answer:

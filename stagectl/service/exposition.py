@@ -134,6 +134,7 @@ class Figures:
         for name, value in status.positions.model_dump().items():
             if value is not None:
                 yield GaugeMetricFamily(f"stagectl_{name.removesuffix('_m')}_meters", name, value=value)
+        yield from _temperatures(status)
         yield from _wear(status)
 
     def exposition(self, status: Status) -> bytes:
@@ -141,6 +142,20 @@ class Figures:
         registry = CollectorRegistry(auto_describe=False)
         registry.register(_Once(list(self.families(status))))  # pyright: ignore[reportArgumentType]
         return generate_latest(registry)
+
+
+def _temperatures(status: Status) -> Iterator[Metric]:
+    if not status.temperatures:
+        return
+    text = "What the drive said last of its temperature, read every 5 s"
+    measured = GaugeMetricFamily("stagectl_drive_temperature_celsius", text, labels=["axis"])
+    text = "1 where the profile's warning is passed"
+    warning = GaugeMetricFamily("stagectl_drive_temperature_warning", text, labels=["axis"])
+    for axis, one in status.temperatures.items():
+        measured.add_metric([axis], one.degc)
+        warning.add_metric([axis], float(one.warning))
+    yield measured
+    yield warning
 
 
 def _wear(status: Status) -> Iterator[Metric]:

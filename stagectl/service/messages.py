@@ -273,6 +273,15 @@ class Health(BaseModel):
     lateness_max_s: float | None
 
 
+class Temperature(BaseModel):
+    """What a drive said of its temperature last."""
+
+    degc: float
+    warning: bool
+    """Whether the profile's warning is passed; it is taken back 2 K below."""
+    age_s: float
+
+
 class Positions(BaseModel):
     """Where the stage is; from the homed zero once it is homed."""
 
@@ -311,6 +320,8 @@ class Status(BaseModel):
     limits: Limits | None
     positions: Positions
     health: Health
+    temperatures: dict[str, Temperature] = {}
+    """By axis, macro and micro; an axis whose drive says none, or whose profile names none, is not here."""
     backlash: Backlash | None
     wear: Wear | None
     fault: Fault | None

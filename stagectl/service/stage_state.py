@@ -20,7 +20,7 @@ from stagectl.service.remembered import Memory, Remembered
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import Event, State
-from stagectl.service.view import BANNERS, backlash_message, health, limits, positions
+from stagectl.service.view import BANNERS, backlash_message, health, limits, positions, temperatures
 from stagectl.service.wear_watch import WearWatch
 from stagectl.signals import STOP_TEXT, Stop
 from stagectl.supervisor import Supervisor
@@ -84,6 +84,7 @@ class StageState:
         """Publish where things stand, and feed the watchdog as long as the servo's cycles, or else this loop, go on."""
         self._heed_record_requests()
         self._look_at_joint()
+        self._say_news()
         status = self._view()
         self.desk.publish(status, self._state)
         self._notifier.feed(status.health.cycles_count if self._stage is not None else time.monotonic_ns())
@@ -96,6 +97,12 @@ class StageState:
         status = stage.status()
         if status["phase"] == Phase.TRACKING:
             wear.look(stage.backlash(status))
+
+    def _say_news(self) -> None:
+        """Have the log hold what the stage noticed by itself."""
+        if self._stage is not None:
+            for news in self._stage.take_news():
+                self._log.say(news.event, news.text, **news.fields)
 
     def _keep_wear(self) -> None:
         """Have what production motion showed survive a restart."""
@@ -183,6 +190,7 @@ class StageState:
             limits=limits(stage.profile if stage is not None else profile),
             positions=positions(status),
             health=health(status, profile.cycle.rate_hz if profile is not None else 0.0, self._late),
+            temperatures=temperatures(stage.temperatures) if stage is not None and connected else {},
             backlash=self._memory.now.backlash,
             wear=None if self._wear is None else self._wear.message(),
             fault=self._fault,

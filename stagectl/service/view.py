@@ -1,6 +1,7 @@
 """How the servo's numbers are laid out for clients. Pure; what is not finite or not known is None."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from stagectl.motion import PLAN_SHARE
 from stagectl.outcome import BacklashEstimate
 from stagectl.profile import Profile
 from stagectl.service import messages
+from stagectl.temperatures import DriveTemperature
 
 BANNERS = {
     "hardware": "HARDWARE: what moves here is real",
@@ -67,6 +69,14 @@ def positions(status: np.void | None) -> messages.Positions:
     if status is not None:
         relative_m = finite(float(status["end_position_m"]) - float(status["macro_position_m"]))
     return messages.Positions(**found, relative_position_m=relative_m)
+
+
+def temperatures(found: Mapping[str, tuple[DriveTemperature, float]]) -> dict[str, messages.Temperature]:
+    """Lay the drives' temperatures and their ages out, by axis."""
+    return {
+        axis: messages.Temperature(degc=one.degc, warning=one.warning, age_s=age_s)
+        for axis, (one, age_s) in found.items()
+    }
 
 
 def health(status: np.void | None, rate_hz: float, late: tuple[float, float] | None) -> messages.Health:
