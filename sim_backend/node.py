@@ -34,6 +34,7 @@ _MAPPING_INDICES = (0x1600, 0x1A00, 0x1A01)
 _SYNC_LOST_PERIODS = 20
 _WATCH_PERIOD_NS = 1_000_000
 _NEVER_NS = 1 << 62
+_TEMPERATURE_REQUEST = struct.pack("<BHB", 0x40, cia402.WINDING_TEMPERATURE >> 8, cia402.WINDING_TEMPERATURE & 0xFF)
 _EMERGENCY = struct.Struct("<HB5x")
 
 _PROCESS_KEYS = frozenset(
@@ -53,6 +54,11 @@ _PROCESS_KEYS = frozenset(
         cia402.DIGITAL_INPUTS,
     )
 )
+
+
+def reads_temperature(payload: bytes) -> bool:
+    """Tell whether an SDO asks for the winding's temperature (CiA 301, 7.2.4.3.5): it needs no motor at this instant."""
+    return payload[:4] == _TEMPERATURE_REQUEST
 
 
 class _Periodic:

@@ -14,7 +14,7 @@ from sim_backend import drive_servo, object_dictionary
 from sim_backend.drive import Drive
 from sim_backend.faults import BUS_KINDS, MACHINE_KINDS, Fault, FaultSchedule, WireFaults
 from sim_backend.interferometer import END_BIT, MACRO_BIT, Interferometer
-from sim_backend.node import DriveNode
+from sim_backend.node import DriveNode, reads_temperature
 from sim_backend.truth import TruthLog
 from stagectl import compose, plant
 from stagectl.compiled import direct
@@ -243,7 +243,10 @@ class Rig:
     def on_frame(self, can_id: int, payload: bytes, t_ns: int) -> list[tuple[int, bytes]]:
         """Take a frame whose end on the bus is at `t_ns`; return what the drives send in answer."""
         sync = can_id == self.nodes[0].sync_cob_id
-        if sync or can_id == 0x000 or can_id & 0x780 == 0x600:
+        # To stop a motor's steps at one more instant changes their lengths, and so what noise makes of the motion:
+        # who only asks how warm it is should change nothing.
+        asks = can_id & 0x780 == 0x600 and not reads_temperature(payload)
+        if sync or can_id == 0x000 or asks:
             self.advance(t_ns)
         elif self.next_event_t_ns <= t_ns:
             self._run_events(t_ns)

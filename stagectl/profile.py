@@ -114,14 +114,15 @@ class Homing(Table):
 
 
 class Temperature(Table):
-    """The drive's object that holds a temperature, of winding or power stage: each vendor has its own."""
+    """The drive's object that holds a temperature, of winding or power stage: each vendor has its own.
+
+    Above `warning_degc` it is said, and nothing else happens: a drive protects itself.
+    """
 
     index: Annotated[int, whole(0x2000, 0x9FFF)]
     subindex: Annotated[int, whole(0, 254)] = 0
     degc_per_count: Annotated[float, above(0.0, 10.0)]
-    warning_degc: Annotated[float, within(-40.0, 300.0)] | None = (
-        None  # said, and nothing else: the drive protects itself
-    )
+    warning_degc: Annotated[float, within(-40.0, 300.0)] | None = None
 
 
 class Axis(Table):

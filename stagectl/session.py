@@ -202,7 +202,7 @@ class Session:
             self._event(news.event, text=news.text, **news.fields)
             self._news.append(news)
 
-    def _temperature_count(self, axis: AxisName, table: Temperature) -> int:
+    def _temperature_count(self, axis: str, table: Temperature) -> int:
         """Read a drive's temperature; no longer than the servo may go without hearing of this side."""
         node_id = self.mappings[axis].node_id
         return self.master.read(node_id, table.index, table.subindex, answer_s=answer_s(self.profile.trip))
@@ -212,7 +212,7 @@ class Session:
         return 1e-9 * self.link.now_t_ns()
 
     @property
-    def temperatures(self) -> dict[AxisName, tuple[DriveTemperature, float]]:
+    def temperatures(self) -> dict[str, tuple[DriveTemperature, float]]:
         """What the drives said of their temperatures last, by axis, and how long ago, s."""
         now_s = self._now_s
         return {axis: (found, now_s - found.t_s) for axis, found in self._temperatures.newest.items()}

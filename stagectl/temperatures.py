@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from stagectl.errors import StagectlError
-from stagectl.profile import AxisName, Temperature, Trip
+from stagectl.profile import Temperature, Trip
 
 EVERY_S = 5.0  # of each axis
 HYSTERESIS_K = 2.0  # that a temperature falls below its warning before that is taken back
@@ -47,12 +47,12 @@ class News:
 class Temperatures:
     """The temperatures of the axes whose profile says where their drive has one."""
 
-    def __init__(self, tables: Mapping[AxisName, Temperature], read_count: Callable[[AxisName, Temperature], int]):
+    def __init__(self, tables: Mapping[str, Temperature], read_count: Callable[[str, Temperature], int]):
         """`read_count` gives the object's value. Errors of it: DriveError, LinkError, which count as no answer."""
         self._tables, self._read_count = tables, read_count
-        self._due_s: dict[AxisName, float] = dict.fromkeys(tables, float("-inf"))
-        self._failures: dict[AxisName, int] = dict.fromkeys(tables, 0)
-        self.newest: dict[AxisName, DriveTemperature] = {}
+        self._due_s: dict[str, float] = dict.fromkeys(tables, float("-inf"))
+        self._failures: dict[str, int] = dict.fromkeys(tables, 0)
+        self.newest: dict[str, DriveTemperature] = {}
         """By axis; none before its first good answer, none after it was given up."""
 
     def look(self, now_s: float, absent: Iterable[str] = ()) -> list[News]:
@@ -70,7 +70,7 @@ class Temperatures:
         self._failures[axis] = 0
         return self._take(axis, degc, now_s)
 
-    def _take(self, axis: AxisName, degc: float, now_s: float) -> list[News]:
+    def _take(self, axis: str, degc: float, now_s: float) -> list[News]:
         before, limit_degc = self.newest.get(axis), self._tables[axis].warning_degc
         warned = before is not None and before.warning
         warning = limit_degc is not None and degc >= limit_degc - (HYSTERESIS_K if warned else 0.0)
@@ -84,7 +84,7 @@ class Temperatures:
             text = f"{axis}: {degc:.1f} degC, more than {HYSTERESIS_K:g} K below {key} again"
         return [News(WARNING if warning else BACK, text, {"axis": axis, "degc": degc, "warning_degc": limit_degc})]
 
-    def _failed(self, axis: AxisName, reason: str) -> list[News]:
+    def _failed(self, axis: str, reason: str) -> list[News]:
         self._failures[axis] += 1
         if self._failures[axis] < FAILURES_LIMIT:
             return []
