@@ -57,7 +57,7 @@ _PROCESS_KEYS = frozenset(
 
 
 def reads_temperature(payload: bytes) -> bool:
-    """Tell whether an SDO asks for the winding's temperature (CiA 301, 7.2.4.3.5): it needs no motor at this instant."""
+    """Tell whether an SDO asks for the winding's temperature (CiA 301, 7.2.4.3.5): needs no motor at this instant."""
     return payload[:4] == _TEMPERATURE_REQUEST
 
 

@@ -554,6 +554,72 @@ def test_a_drive_may_take_half_a_second_to_answer():
         network.disconnect()
 
 
+class SlowDrive:
+    """A drive on a virtual bus whose answers about one object come when `go` is set; a master beside it."""
+
+    def __init__(self, channel):
+        self.go, self.asked = threading.Event(), threading.Event()
+        self.network = canopen.Network()
+        self.network.connect(interface="virtual", channel=channel)
+        self.drive = self.network.create_node(Drive(1, EDS_LINEAR))
+        self.drive.add_read_callback(self.read)
+        self.master = Master(can.Bus(interface="virtual", channel=channel))
+        self.master.add_node(1, EDS_LINEAR)
+
+    def read(self, index, subindex, od):
+        if index == 0x2010:
+            self.asked.set()
+            assert self.go.wait(30.0)
+            return 415
+        return None
+
+    def close(self):
+        self.go.set()
+        self.master.close()
+        self.network.disconnect()
+
+
+@pytest.fixture
+def slow_drive(request):
+    opened = SlowDrive(request.node.name)
+    yield opened
+    opened.close()
+
+
+def test_an_answer_may_be_waited_for_no_longer_than_that(slow_drive):
+    """The drive answers never, as far as this test goes: that it ends shows that nobody waits for it."""
+    master = slow_drive.master
+    with pytest.raises(LinkError, match="0x2010:00: No SDO response"):
+        master.read(1, 0x2010, answer_s=0.01)
+    assert slow_drive.asked.wait(30.0)
+    assert master._nodes[1].sdo.RESPONSE_TIMEOUT == 1.0  # of everybody else
+
+
+def test_an_answer_that_was_given_up_is_not_the_next_one_s(slow_drive):
+    master = slow_drive.master
+    with pytest.raises(LinkError, match="0x2010:00: No SDO response"):
+        master.read(1, 0x2010, answer_s=0.01)
+    # The drive's late answer is on the bus before that to the next request, in this order.
+    late = threading.Timer(0.05, slow_drive.go.set)
+    late.start()
+    assert master.read(1, cia402.IDENTITY, 0) == 4
+    late.join()
+    assert master.read(1, 0x2010, answer_s=30.0) == 415
+    assert master.read(1, cia402.IDENTITY, 0) == 4
+
+
+def test_who_waits_shortly_does_not_wait_for_another_sdo_either(slow_drive):
+    master, found = slow_drive.master, []
+    other = threading.Thread(target=lambda: found.append(master.read(1, 0x2010, answer_s=30.0)))
+    other.start()
+    assert slow_drive.asked.wait(30.0)
+    with pytest.raises(LinkError, match="another SDO is under way for more than 0.01 s"):
+        master.read(1, cia402.IDENTITY, 0, answer_s=0.01)
+    slow_drive.go.set()
+    other.join(30.0)
+    assert found == [415]  # undisturbed
+
+
 def test_silent_node_is_a_link_error(bench):
     bench.network.nodes[2].remove_network()
     with pytest.raises(LinkError, match=r"node 2: 0x1018:00: No SDO response.*node id and bit rate"):

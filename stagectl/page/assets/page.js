@@ -115,6 +115,17 @@ function showHealth(status) {
   byId('recording-tile').classList.toggle('bad', Boolean(recording?.trouble));
 }
 
+function showTemperatures(temperatures) {
+  const all = Object.entries(temperatures);
+  byId('temperature-tile').hidden = all.length === 0;
+  if (!all.length) return;
+  const hottest = Math.max(...all.map(([, one]) => one.degc));
+  const above = all.filter(([, one]) => one.warning).map(([axis]) => axis);
+  write('temperature', `${number(hottest, 1, 1)} °C`);
+  write('temperatures', above.length ? `${above.join(', ')} above the warning` : all.map(([axis, one]) => `${axis} ${number(one.degc, 1, 1)}`).join(', '));
+  byId('temperature-tile').classList.toggle('bad', above.length > 0);
+}
+
 function showFault(fault) {
   byId('fault').hidden = !fault;
   if (!fault) return;
@@ -135,6 +146,7 @@ function showStatus(status) {
   document.title = `${status.state} – ${status.profile}`;
   showPositions(status);
   showHealth(status);
+  showTemperatures(status.temperatures ?? {});
   showFault(status.fault);
   operator.update(status);
   write('doing', meaning(operator.situation));
