@@ -613,7 +613,7 @@ def test_who_waits_shortly_does_not_wait_for_another_sdo_either(slow_drive):
     other = threading.Thread(target=lambda: found.append(master.read(1, 0x2010, answer_s=30.0)))
     other.start()
     assert slow_drive.asked.wait(30.0)
-    with pytest.raises(LinkError, match="another SDO is under way for more than 0.01 s"):
+    with pytest.raises(LinkError, match=r"another SDO is under way for more than 0\.01 s"):
         master.read(1, cia402.IDENTITY, 0, answer_s=0.01)
     slow_drive.go.set()
     other.join(30.0)
