@@ -79,7 +79,7 @@ class Temperatures:
             return []
         key = f"{axis}.temperature.warning_degc = {limit_degc:g} degC"
         if warning:
-            text = f"{axis}: {degc:.1f} degC reach {key}; have it move less, or cool the motor"
+            text = f"{axis}: {degc:.1f} degC, limit {key}; have it move less, or cool the motor"
         else:
             text = f"{axis}: {degc:.1f} degC, more than {HYSTERESIS_K:g} K below {key} again"
         return [News(WARNING if warning else BACK, text, {"axis": axis, "degc": degc, "warning_degc": limit_degc})]

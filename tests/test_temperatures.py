@@ -89,7 +89,7 @@ def test_a_warning_is_said_once_a_crossing_and_taken_back_2_k_below():
     drives.degc["macro"] = 81.2
     (news,) = drives.look(len(degrees) * EVERY_S)
     assert news.text == (
-        "macro: 81.2 degC reach macro.temperature.warning_degc = 80 degC; have it move less, or cool the motor"
+        "macro: 81.2 degC, limit macro.temperature.warning_degc = 80 degC; have it move less, or cool the motor"
     )
     assert news.fields == {"axis": "macro", "degc": pytest.approx(81.2), "warning_degc": 80.0}
     assert drives.temperatures.newest["macro"].warning

@@ -233,7 +233,7 @@ def status_table(found: messages.Status) -> Table:
 
 def _temperature(axis: str, one: messages.Temperature) -> str:
     text = f"{axis} {one.degc:.1f} degC"
-    return f"[yellow]{text}, above its warning[/]" if one.warning else text
+    return f"[yellow]{text}, warning[/]" if one.warning else text
 
 
 def log(voice: Voice, socket: Path | None, lines_count: int) -> Answer:

@@ -74,3 +74,19 @@ def test_wear_is_exposed_with_age_and_alarm():
         "stagectl_backlash_wear_alarm 1.0",
     ):
         assert line in text.splitlines()
+
+
+def test_temperatures_are_exposed_by_axis_and_left_out_where_none_is_known():
+    known = {
+        "macro": messages.Temperature(degc=41.5, warning=False, age_s=1.0),
+        "micro": messages.Temperature(degc=93.0, warning=True, age_s=2.0),
+    }
+    lines = Figures().exposition(STATUS.model_copy(update={"temperatures": known})).decode().splitlines()
+    for line in (
+        'stagectl_drive_temperature_celsius{axis="macro"} 41.5',
+        'stagectl_drive_temperature_celsius{axis="micro"} 93.0',
+        'stagectl_drive_temperature_warning{axis="macro"} 0.0',
+        'stagectl_drive_temperature_warning{axis="micro"} 1.0',
+    ):
+        assert line in lines
+    assert "temperature" not in Figures().exposition(STATUS).decode()

@@ -78,7 +78,7 @@ def test_current_warms_a_drive_and_metrics_status_and_log_say_so(warm):
     assert shown.temperatures["macro"].age_s >= 0.0
     console = Console(record=True, width=200, file=io.StringIO())
     console.print(status_table(shown))
-    assert re.search(r"drives +macro 2\d\.\d degC, above its warning", console.export_text())
+    assert re.search(r"drives +macro 2\d\.\d degC, warning", console.export_text())
     warm.until(lambda: warm.client.lease_state() is None, "a free lease")
 
 

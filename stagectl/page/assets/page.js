@@ -120,10 +120,10 @@ function showTemperatures(temperatures) {
   byId('temperature-tile').hidden = all.length === 0;
   if (!all.length) return;
   const hottest = Math.max(...all.map(([, one]) => one.degc));
-  const above = all.filter(([, one]) => one.warning).map(([axis]) => axis);
+  const warned = all.filter(([, one]) => one.warning).map(([axis]) => axis);
   write('temperature', `${number(hottest, 1, 1)} °C`);
-  write('temperatures', above.length ? `${above.join(', ')} above the warning` : all.map(([axis, one]) => `${axis} ${number(one.degc, 1, 1)}`).join(', '));
-  byId('temperature-tile').classList.toggle('bad', above.length > 0);
+  write('temperatures', warned.length ? `warning: ${warned.join(', ')}` : all.map(([axis, one]) => `${axis} ${number(one.degc, 1, 1)}`).join(', '));
+  byId('temperature-tile').classList.toggle('bad', warned.length > 0);
 }
 
 function showFault(fault) {
