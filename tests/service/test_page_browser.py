@@ -103,6 +103,13 @@ def velocity_m_per_s(daemon):
     return abs(daemon.plant["macro_velocity_m_per_s"])
 
 
+def test_the_drives_temperatures_stand_beside_the_cycles(opened, idle):
+    page = opened(Role.OBSERVE)
+    expect(page.locator("#temperature-tile")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.locator("#temperature")).to_have_text(re.compile(r"^2\d\.\d °C$"))
+    expect(page.locator("#temperatures")).to_have_text(re.compile(r"^macro 2\d\.\d$"))
+
+
 def test_an_operator_homes_moves_jogs_while_held_and_stops(idle, opened):
     page = armed_page(opened)
     page.fill("#target", "10")
