@@ -1,6 +1,7 @@
 """What was chosen, in words and numbers: effects by name, known parameters by their errors. Pure."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,16 +25,13 @@ def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
         term = search.term(group)
         if term.acts_on == "parameter":
             continue
-        values, sds = solution.of(group)
         rest = judge.gains([other for other in chosen if other is not group])
-        parameters, errors = _readable(term, values, sds, _places(solution, group))
-        if term.linear:
-            parameters, errors = _in_true_force(search, solution, term, parameters, errors)
+        parameters, errors = _sized(search, solution, group)
         found.append(
             Named(
                 name=term.name,
                 acts_on=term.acts_on,
-                parameters=parameters if not term.linear else term.shape | parameters,
+                parameters=parameters,
                 sds=errors,
                 gain=whole[0] - rest[0],
                 held_out_gain=whole[1] - rest[1],
@@ -41,6 +39,32 @@ def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
             )
         )
     return tuple(found)
+
+
+def measured(
+    search: Competition, chosen: Sequence[Group], solution: Solution, named: Sequence[Named]
+) -> tuple[Named, ...]:
+    """Return names of `chosen` with the parameters and deviations of a solution; others as they are."""
+    groups = {group.key: group for group in chosen}
+    found = []
+    for one in named:
+        group = groups.get((one.name, one.acts_on))
+        if group is None:
+            found.append(one)
+        else:
+            parameters, sds = _sized(search, solution, group)
+            found.append(replace(one, parameters=parameters, sds=sds))
+    return tuple(found)
+
+
+def _sized(search: Competition, solution: Solution, group: Group) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the parameters of an effect, and the deviations of those that were solved for."""
+    term = search.term(group)
+    parameters, errors = _readable(term, *solution.of(group), _places(solution, group))
+    if not term.linear:
+        return parameters, errors
+    parameters, errors = _in_true_force(search, solution, term, parameters, errors)
+    return term.shape | parameters, errors
 
 
 _MOTOR_QUANTITIES = {
