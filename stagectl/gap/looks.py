@@ -5,6 +5,7 @@ each closer look; one more is taken where a name has moved the joint again. Pure
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from stagectl.gap.competition import Competition
@@ -18,7 +19,17 @@ from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
-from stagectl.gap.settling import moved_now, moves_joint, remeasured, stands
+from stagectl.gap.selection import ALIAS_GAIN
+from stagectl.gap.settling import (
+    changes_commands,
+    left_at_size,
+    moved_by,
+    moved_now,
+    moves_joint,
+    moves_readings,
+    remeasured,
+    stands,
+)
 
 _CLOSER_LOOKS = 4
 
@@ -66,13 +77,56 @@ def looked_closely(
             look = known = Look(known.search, left, named)
             plain = known if known.search is first else plain
         elif any(group.is_slope for group in chosen):
-            known, moved = look, moved_now(search, chosen)  # both at their sizes
+            look = known = _of_best_form(look, unsettled, crew)
+            moved = moved_now(search, known.chosen)  # both at their sizes
         else:
             break
     before = excess(first, [])
     if unknown_rest(look.search, look.chosen, before) and not unknown_rest(first, plain.chosen, before):
         look = plain  # the first look had reached the floor
     return _measured(look)
+
+
+def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Look:
+    """Return a look with each slope as the law that leaves least at its size: a delay and a lag begin alike."""
+    search, chosen, named = look.search, list(look.chosen), look.named
+    for k, group in enumerate(look.chosen):
+        if not group.is_slope:
+            continue
+        rest = [*chosen[:k], *chosen[k + 1 :]]
+        least = search.judge.gain(chosen) - ALIAS_GAIN
+        forms = [group]
+        for other in search.judge.rivals(rest):
+            same = other.is_slope and other.key[1] == group.key[1] and other.key[0] != group.key[0]
+            if same and search.judge.gain([*rest, other]) > least:
+                forms.append(other)
+        left = [_left_under(search, [*rest, form], unsettled, crew) for form in forms] if len(forms) > 1 else [0.0]
+        best = left.index(min(left))
+        gone = {form.key for form, more in zip(forms, left, strict=True) if more > left[best] + ALIAS_GAIN}
+        search.judge.trace.append(
+            "at their sizes: "
+            + "; ".join(f"{form.key} leaves {more:.0f}" for form, more in zip(forms, left, strict=True))
+        )
+        chosen[k] = forms[best]
+        named = (*(one for one in named if (one.name, one.acts_on) != group.key), *_named_as(look, chosen, k, gone))
+    return Look(search, chosen, named)
+
+
+def _named_as(look: Look, chosen: list[Group], k: int, gone: set[tuple[str, str]]) -> tuple[Named, ...]:
+    """Return one of `chosen` in words, without the aliases that are `gone`."""
+    return tuple(
+        replace(one, aliases=tuple(alias for alias in one.aliases if alias[:2] not in gone))
+        for one in all_named(look.search, chosen)
+        if (one.name, one.acts_on) == chosen[k].key
+    )
+
+
+def _left_under(search: Competition, chosen: list[Group], unsettled: Sequence[Recording], crew: Crew) -> float:
+    """Return what is left above the noise with all that moves the joint at its size."""
+    moving = [group for group in chosen if moves_readings(search, group) or changes_commands(search, group)]
+    moved = (*moved_now(search, chosen), *(moved_by(search, chosen, group) for group in moving))
+    beside = tuple(search.term(group) for group in chosen if group not in moving)
+    return left_at_size(unsettled, search.noise, moved, beside, crew)
 
 
 def _measured(look: Look) -> Look:

@@ -57,18 +57,8 @@ def settled(
     there = recordings
     for _ in range(_PASSES_BESIDE if beside else _EDGE_PASSES):
         there = crew.here(partial(_put, out, moved), recordings)
-        crew.here(lambda recording: balance.set_noise(recording, noise), there)
-        evidence = Evidence(there, crew)
         parameters = hypotheses.parameter_terms(there[0])
-        terms = [*(term for term, _ in parameters), *(hypotheses.deviation_term(*one) for one in moved), *beside]
-        sds = [(sd,) for _, sd in parameters] + [(DEVIATION_SD,)] * len(moved)
-        sds += [widest_amplitudes(term) for term in beside]
-        base = [
-            Group(term.key, columns, term.scope, prior, term.bounds)
-            for term, columns, prior in zip(terms, evidence.add_all(terms), sds, strict=True)
-        ]
-        evidence.finish(np.concatenate(sds), 0, 0)
-        solution = solve(base, evidence.sums)
+        base, solution, _ = _fitted(there, noise, moved, beside, crew)
         moved = tuple(
             _changed(one, float(solution.of(group)[0][0]))
             for one, group in zip(moved, base[len(parameters) :], strict=False)
@@ -84,6 +74,41 @@ def settled(
     if not moved and max(abs(out["left_m"]), abs(out["right_m"])) >= _EDGE_SDS * _edge_sd_m(there[0]):
         return recordings, moved, beside  # something else pulls at them
     return crew.here(partial(_put, out, moved), recordings), moved, beside
+
+
+def _fitted(
+    recordings: Sequence[Recording],
+    noise: dict[str, Noise],
+    moved: tuple[Moved, ...],
+    beside: Sequence[Term],
+    crew: Crew,
+) -> tuple[list[Group], Solution, float]:
+    """Fit known parameters, sizes of what has moved the joint, and what acts beside; the last is what that leaves."""
+    crew.here(lambda recording: balance.set_noise(recording, noise), recordings)
+    evidence = Evidence(recordings, crew)
+    parameters = hypotheses.parameter_terms(recordings[0])
+    terms = [*(term for term, _ in parameters), *(hypotheses.deviation_term(*one) for one in moved), *beside]
+    sds = [(sd,) for _, sd in parameters] + [(DEVIATION_SD,)] * len(moved)
+    sds += [widest_amplitudes(term) for term in beside]
+    base = [
+        Group(term.key, columns, term.scope, prior, term.bounds)
+        for term, columns, prior in zip(terms, evidence.add_all(terms), sds, strict=True)
+    ]
+    evidence.finish(np.concatenate(sds), 0, 0)
+    solution = solve(base, evidence.sums)
+    return base, solution, sum(float(s.gram[0, 0]) - s.count for s in evidence.sums) - solution.gain
+
+
+def left_at_size(
+    recordings: Sequence[Recording],
+    noise: dict[str, Noise],
+    moved: tuple[Moved, ...],
+    beside: Sequence[Term],
+    crew: Crew,
+) -> float:
+    """Return what is left above the noise where all of `moved` has been put where the recordings have it."""
+    there, moved, beside = settled(recordings, noise, moved, beside, crew)
+    return _fitted(there, noise, moved, beside, crew)[2]
 
 
 def _put(out: dict[str, float], moved: tuple[Moved, ...], recording: Recording) -> Recording:
@@ -132,17 +157,20 @@ _LEAST_POWER = 0.1
 
 
 def _grown(term: Term, share: float, recordings: Sequence[Recording]) -> float:
-    """Return the size at which an effect does `share` times what it does, by the power of its size that it follows."""
+    """Return the size at which an effect does `share` times what it does."""
+    size = term.shape[CATALOGUE[term.name].parameters[0]]
+    return size * max(share, 0.0) ** (1.0 / power_of_size(term, recordings))
+
+
+def power_of_size(term: Term, recordings: Sequence[Recording]) -> float:
+    """Return the power of its size that an effect follows where it is: -2 of a force at which iron saturates."""
     name = CATALOGUE[term.name].parameters[0]
-    size = term.shape[name]
-    here, there = (
-        sum(squares_of(forces) for r in recordings for forces in one.forces(r))
-        for one in (term, with_shape(term, {name: size * (1.0 + _GROWN_RATIO)}))
-    )
+    larger = with_shape(term, {name: term.shape[name] * (1.0 + _GROWN_RATIO)})
+    here, there = (sum(squares_of(f) for r in recordings for f in one.forces(r)) for one in (term, larger))
     if not (here > 0.0 and there > 0.0):
-        return size * share
+        return 1.0
     power = 0.5 * float(np.log(there / here) / np.log1p(_GROWN_RATIO))
-    return size * share ** (1.0 / power) if abs(power) > _LEAST_POWER else size
+    return power if abs(power) > _LEAST_POWER else 1.0
 
 
 def _changed(moved: Moved, ratio: float) -> Moved:
