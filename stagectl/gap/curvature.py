@@ -153,7 +153,7 @@ def _stepped(search: Competition, chosen: Sequence[Group], slopes: Sequence[_Slo
         shape = {}
         for slope in slopes:
             if slope.key == term.key and slope.shape in term.shape:
-                low, high = CATALOGUE[term.name].bounds[slope.shape]
+                low, high = reach_of(search.evidence.recordings, term, slope.shape, 1.0)
                 there = term.shape[slope.shape] + slope.step * float(np.mean(solution.of(slope.group)[0]))
                 shape[slope.shape] = float(np.clip(there, low, high))
         if shape:
