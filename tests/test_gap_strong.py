@@ -17,6 +17,7 @@ from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group, solve
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner
+from stagectl.gap.settling import _resized, power_of_size
 
 H, STEPS, MASS, NOISE_M = 1e-3, 10, 40.0, 5e-9
 DURATION_S = 8.0
@@ -208,3 +209,12 @@ def test_a_share_of_the_mass_is_as_uncertain_as_its_frequency_and_damping_make_i
     assert found["frequency_hz"] == pytest.approx(MODE_HZ, rel=3e-4)
     assert found["damping_ratio"] == pytest.approx(MODE_DAMPING, rel=0.01)
     assert sd > 2.0 * plain.of(chosen[0])[1][0]
+
+
+def test_a_size_that_is_no_factor_follows_the_power_of_its_law():
+    """What saturates does a fifth more at a size that is a tenth smaller: resized in proportion it ran away."""
+    term = hypotheses.term_at_size(CATALOGUE["force_constant_saturation"], "macro_actuator", {"saturation_n": 400.0})
+    assert power_of_size(term, _recordings()) == pytest.approx(-2.0, abs=0.01)
+    assert _resized(term, 1.2, _recordings()).shape["saturation_n"] == pytest.approx(400.0 / np.sqrt(1.2), rel=1e-3)
+    delay = hypotheses.term_at_size(CATALOGUE["command_delay"], "macro_command", {"delay_s": 100e-6})
+    assert power_of_size(delay, _recordings()) == pytest.approx(1.0, abs=0.01)
