@@ -8,9 +8,11 @@ import pytest
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
+from stagectl.gap.contact import contact_at
 from stagectl.gap.effect_forces import effect_forces, known_forces
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.findings import Named
+from stagectl.gap.grids import grids_for
 from stagectl.gap.log import Log
 from stagectl.gap.motion import motion_of, motion_under
 from stagectl.gap.naming import friction_that_drives, second_pitches
@@ -135,6 +137,47 @@ def test_edges_that_wear_lie_further_out_at_every_instant(touching):
     assert lost_m == pytest.approx([1.25e-6, 36.25e-6], abs=0.02e-6)
     known = balance.foretold_under(there, known_forces(there))
     assert np.max(known.penetration_m[crests[1]]) == pytest.approx(50e-6 - 36.25e-6, abs=0.1e-6)
+
+
+@pytest.mark.parametrize("rate_m_per_s", [0.02, -0.02])
+def test_an_edge_is_passed_at_its_own_instant(rate_m_per_s):
+    """What the contact presses in all is what it presses in continuous time, wherever in a part the edge is passed."""
+    part_s = H / 4
+    middles_s = part_s * (np.arange(40).reshape(10, 4) - 19.5)
+    fine_s = np.linspace(-20.0 * part_s, 20.0 * part_s, 400_001)
+    for passed_s in part_s * np.linspace(0.0, 1.0, 9):
+        x_b = JOINT.right_m + rate_m_per_s * (middles_s - passed_s)
+        push_n = contact_at(STAGE, JOINT, x_b, np.full_like(x_b, rate_m_per_s)).push_n(JOINT, 90.0)
+        depth_m = rate_m_per_s * (fine_s - passed_s)
+        exact_n = np.maximum(JOINT.right_stiffness_n_per_m * depth_m + 90.0 * rate_m_per_s, 0.0) * (depth_m > 0.0)
+        assert np.min(push_n) >= 0.0
+        assert part_s * np.sum(push_n) == pytest.approx(np.trapezoid(exact_n, fine_s), rel=1e-4)
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_of_two_bodies_that_are_both_late_the_contact_notices_nothing(beside):
+    """At 0.2 m/s a delay moves an edge by 0.2 um a microsecond: slopes over 2 % of it disagreed about a third of it."""
+    sizes_s = {"macro_sensor": 400e-6, "end_sensor": 150e-6}
+    zeros = np.zeros(COUNT)
+    log = Log(
+        "run", H, 5.0 * _swing(T_S) + 80e-6 * np.sin(2.0 * np.pi * 0.5 * T_S), zeros, np.ones(COUNT, bool), "1",
+        end_position_m=5.0 * _swing(T_S), micro_command_n=zeros,
+    )  # fmt: skip
+    delay = CATALOGUE["sensor_delay"]
+    moved = [(delay, place, {"delay_s": size_s}) for place, size_s in sizes_s.items()]
+    there = operating_point(balance.recording_of(log, STAGE), moved if beside else moved[:1])
+    terms = [hypotheses.deviation_term(*moved[0])]
+    slopes = [terms[0].forces(there)[0].end_n / 400e-6]
+    if beside:
+        slopes.append(hypotheses.deviation_term(*moved[1]).forces(there)[0].end_n / 150e-6)
+    else:
+        least_s = min(shape["delay_s"] for shape in grids_for([there])["sensor_delay"])
+        term = hypotheses.term_of(delay, "end_sensor", {"delay_s": least_s})
+        slopes.append(term.forces(there)[0].end_n / least_s)
+    alone, other = slopes
+    inner = slice(round(0.1 / H), -round(0.1 / H))
+    assert np.std(alone[inner]) > 100.0
+    assert np.std((alone + other)[inner].mean(axis=1)) < 0.05 * np.std(alone[inner])
 
 
 def test_an_edge_that_is_far_off_is_found_however_shallow_the_contact():

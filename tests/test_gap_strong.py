@@ -10,12 +10,14 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses, seeds
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.competition import Competition
+from stagectl.gap.curvature import at_best_shapes
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.log import Log
 from stagectl.gap.noise import slow_noise
-from stagectl.gap.normal_equations import Group
+from stagectl.gap.normal_equations import Group, solve
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner
+from stagectl.gap.settling import _resized, power_of_size
 
 H, STEPS, MASS, NOISE_M = 1e-3, 10, 40.0, 5e-9
 DURATION_S = 8.0
@@ -173,3 +175,46 @@ def test_a_mass_that_swings_is_all_that_a_motion_leaves_that_knows_nothing_of_it
         left.append(sum(at_size))
     noise = np.sqrt(2.0 * sum(s.count for s in evidence.sums))
     assert left[0] < 4.0 * noise < min(left[1:])  # the ringing reaches the frequencies that noise is read off
+
+
+SHARE, MODE_HZ, MODE_DAMPING = 0.06, 22.0, 0.02
+
+
+def _ringing() -> Callable[[float, float, float], float]:
+    """Make a motor's force less what a share of the mass on a spring takes of it, stepped as finely as the axis."""
+    h, w = H / STEPS, 2.0 * np.pi * MODE_HZ
+    state = np.zeros(2)
+
+    def made_n(command_n: float, x: float, v: float) -> float:
+        pull = (command_n / MASS + 2.0 * MODE_DAMPING * w * state[1] + w * w * state[0]) / (1.0 - SHARE)
+        state[1] -= h * pull
+        state[0] += h * state[1]
+        return command_n + SHARE * MASS * pull
+
+    return made_n
+
+
+@pytest.mark.parametrize("off", [(1.0, 1.0), (0.995, 1.1)])
+def test_a_share_of_the_mass_is_as_uncertain_as_its_frequency_and_damping_make_it(off: tuple[float, float]):
+    """At given shapes its deviation is less than half as large; and a frequency that is 0.5 % off is brought back."""
+    recordings = [balance.recording_of(_axis_under(_ringing(), seed), AXIS) for seed in (1, 2)]
+    shape = {"share_ratio": off[1] * SHARE, "frequency_hz": off[0] * MODE_HZ, "damping_ratio": off[1] * MODE_DAMPING}
+    term = hypotheses.term_at_size(CATALOGUE["flexible_mode"], "macro_force", shape)
+    search = Competition(recordings, 2, noise=slow_noise(AXIS, recordings[0]), kept=[term])
+    chosen, solution = at_best_shapes(search, search.kept)
+    plain = solve([*search.judge.base, *chosen], search.evidence.sums)
+    found = search.term(chosen[0]).shape
+    (share,), (sd,) = solution.of(chosen[0])
+    assert abs(share * found["share_ratio"] - SHARE) < 3.0 * sd * SHARE
+    assert found["frequency_hz"] == pytest.approx(MODE_HZ, rel=3e-4)
+    assert found["damping_ratio"] == pytest.approx(MODE_DAMPING, rel=0.01)
+    assert sd > 2.0 * plain.of(chosen[0])[1][0]
+
+
+def test_a_size_that_is_no_factor_follows_the_power_of_its_law():
+    """What saturates does a fifth more at a size that is a tenth smaller: resized in proportion it ran away."""
+    term = hypotheses.term_at_size(CATALOGUE["force_constant_saturation"], "macro_actuator", {"saturation_n": 400.0})
+    assert power_of_size(term, _recordings()) == pytest.approx(-2.0, abs=0.01)
+    assert _resized(term, 1.2, _recordings()).shape["saturation_n"] == pytest.approx(400.0 / np.sqrt(1.2), rel=1e-3)
+    delay = hypotheses.term_at_size(CATALOGUE["command_delay"], "macro_command", {"delay_s": 100e-6})
+    assert power_of_size(delay, _recordings()) == pytest.approx(1.0, abs=0.01)

@@ -34,15 +34,20 @@ class Competition:
         nulls_count: int = 0,
         seed: int = 0,
         without: frozenset[str] = frozenset(),
+        refused: frozenset[tuple[str, str]] = frozenset(),
         moved: tuple[Moved, ...] = (),
         kept: Sequence[Term] = (),
         noise: dict[str, Noise],
         crew: Crew | None = None,
     ):
-        """Whiten, make the columns, sum. `moved` effects are part of the recordings already, `kept` terms start."""
+        """Whiten, make the columns, sum. `moved` effects are part of the recordings already, `kept` terms start.
+
+        Names of `without` and those `refused` at their places don't compete.
+        """
         self._crew: Crew = crew or Serial()
         self._crew.here(lambda recording: balance.set_noise(recording, noise), recordings)
         self.moved = moved
+        self.noise = noise
         self.evidence = evidence = Evidence(recordings, self._crew)
         self.parameters = hypotheses.parameter_terms(recordings[0])
         self.curves: list[Group] = []
@@ -53,7 +58,7 @@ class Competition:
         base += self._taken([hypotheses.deviation_term(*one) for one in moved], [(DEVIATION_SD,)] * len(moved))
         self.kept += self._taken(kept)
         known_sds = np.array(self._sds)
-        taken = {(effect.name, place) for effect, place, _ in moved}
+        taken = refused | {(effect.name, place) for effect, place, _ in moved}
         grids = grids_for(recordings)
         wrong = hypotheses.wrong_parameter_terms(recordings[0])
 

@@ -9,7 +9,7 @@ from stagectl.gap.contact import contact_damping_n_s_per_m
 from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
 from stagectl.gap.late_readings import makes_late
 from stagectl.gap.quantities import along_motion, quantities
-from stagectl.gap.reading_errors import misread, more_contact_n, reading_error_m
+from stagectl.gap.reading_errors import SMALL_M, misread, more_contact_n, reading_error_m
 from stagectl.gap.recording import Recording, contact_of, relative_motion, with_late
 
 
@@ -95,7 +95,7 @@ def effect_forces(
     if place in ("contact", "joint"):
         return between(recording, value)
     if place == "contact_edge":
-        return _edges_moved(recording, effect, parameters, value, whole)
+        return _edges_moved(recording, effect, parameters, whole)
     if place.endswith("_actuator"):
         return motor_forces(recording, axis, value, None)
     if axis == "macro" and "micro_motor_force_n" in effect.quantities:
@@ -164,17 +164,15 @@ def motor_forces(recording: Recording, axis: str, force_n: np.ndarray, current_a
     return Forces(macro_n=-reaction * force_n if reaction else None, end_n=force_n, end_current_a=current_a)
 
 
-def _edges_moved(
-    recording: Recording, effect: Effect, parameters: list[float], value: np.ndarray, whole: bool
-) -> Forces:
+def _edges_moved(recording: Recording, effect: Effect, parameters: list[float], whole: bool) -> Forces:
     """Return what edges further out change: a joint that overlaps less."""
     joint, end = recording.believed.joint, recording.end
     if joint is None or end is None or recording.side is None:
         return Forces()
-    if not whole:
-        stiffness = quantities(recording, "end", "contact_edge")["contact_stiffness_n_per_m"]
-        return between(recording, -recording.side * value * stiffness)
-    return between(recording, more_contact_n(recording, joint, 0.0, 0.0, *edges_out_m(recording, effect, parameters)))
+    left_m, right_m = edges_out_m(recording, effect, parameters)
+    share = 1.0 if whole else SMALL_M / max(float(np.max(np.abs([left_m, right_m]))), SMALL_M)
+    more_n = more_contact_n(recording, 0.0, 0.0, share * left_m, share * right_m)
+    return between(recording, more_n / share)
 
 
 def edges_out_m(recording: Recording, effect: Effect, parameters: list[float]) -> tuple[np.ndarray, np.ndarray]:

@@ -238,7 +238,10 @@ class Evidence:
             s = self.sums[k]
             nulls = np.hstack([s.nulls, np.zeros((s.nulls.shape[0], len(numbers)))])
             self.sums[k] = replace(s, gram=np.block([[s.gram, cross], [cross.T, own]]), nulls=nulls)
-        return Group(term.key, numbers, term.scope, prior_sds, term.bounds, searched, self.places_count(term.scope))
+        places_count = self.places_count(term.scope)
+        return Group(
+            term.key, numbers, term.scope, prior_sds, term.bounds, searched, places_count, is_slope=term.is_slope
+        )
 
 
 def _innovations_of(recording: Recording) -> list[Channel]:

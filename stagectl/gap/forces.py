@@ -38,6 +38,11 @@ def scaled_forces(forces: Forces, factor: float, more: Forces) -> Forces:
     return total
 
 
+def squares_of(forces: Forces) -> float:
+    """Return the sum of the squares of all that forces hold, in their units: to compare one law with itself."""
+    return sum(float(np.sum(value * value)) for value in _values_of(forces) if value is not None)
+
+
 def _values_of(forces: Forces) -> tuple[np.ndarray | None, ...]:
     """Return the fields in their order, without copies."""
     return tuple(getattr(forces, one.name) for one in fields(forces))

@@ -12,7 +12,6 @@ from stagectl.gap.crew import Crew
 from stagectl.gap.effect_forces import known_forces
 from stagectl.gap.forces import sum_of_forces
 from stagectl.gap.hypotheses import Term
-from stagectl.gap.innovations import Noise
 from stagectl.gap.noise import Explained
 from stagectl.gap.normal_equations import Group
 from stagectl.gap.operating_point import Moved
@@ -33,24 +32,25 @@ class KnownMotion(NamedTuple):
 
 def moved_under(
     known: list[Group],
-    first: Competition,
+    moved: tuple[Moved, ...],
+    search: Competition,
     unsettled: Sequence[Recording],
-    noise: dict[str, Noise],
     crew: Crew,
 ) -> KnownMotion:
     """Return the recordings along the motion that `known` effects make, at the place where they put the joint.
 
-    unsettled: the recordings before the joint's edges were put where they are.
+    known, moved: what was found in a search, and what was part of its operating point already; unsettled: the
+    recordings before the joint's edges were put where they are.
     """
-    moving = [group for group in known if moves_readings(first, group) or changes_commands(first, group)]
+    moving = [group for group in known if moves_readings(search, group) or changes_commands(search, group)]
     still = [group for group in known if group not in moving]
-    explained, driving = first.explained(still), first.explained(still, but=Trait.SWINGS)
-    first.evidence.forget_trials()
+    explained, driving = search.explained(still), search.explained(still, but=Trait.SWINGS)
+    search.evidence.forget_trials()
     there, moved, kept = settled(
         unsettled,
-        noise,
-        tuple(moved_by(first, known, group) for group in moving),
-        tuple(first.term(group) for group in still),
+        search.noise,
+        (*moved, *(moved_by(search, known, group) for group in moving)),
+        tuple(search.term(group) for group in still),
         crew,
     )
     for _ in range(_FORETOLD_PASSES if still else 1):

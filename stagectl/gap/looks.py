@@ -1,25 +1,37 @@
-"""Two looks at the same recordings: along the motion as believed, and along the motion under what the first look found.
+"""Looks at the same recordings: along the motion as believed, then along the motion under what was found so far.
 
 An effect is known along a motion that knows of the effect, and an edge where the joint is. Everything competes again in
-the second look. Pure.
+each closer look; one more is taken where a name has moved the joint again. Pure.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Crew
+from stagectl.gap.curvature import at_best_shapes
 from stagectl.gap.findings import Named
-from stagectl.gap.innovations import Noise
 from stagectl.gap.known_motion import moved_under
 from stagectl.gap.left_over import excess, unknown_rest
-from stagectl.gap.naming import all_named
+from stagectl.gap.naming import all_named, measured
 from stagectl.gap.noise import noise_of
-from stagectl.gap.normal_equations import Group
+from stagectl.gap.normal_equations import Group, Solution, solve
+from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
-from stagectl.gap.settling import moves_joint, remeasured, stands
+from stagectl.gap.selection import ALIAS_GAIN
+from stagectl.gap.settling import (
+    changes_commands,
+    left_at_size,
+    moved_by,
+    moved_now,
+    moves_joint,
+    moves_readings,
+    remeasured,
+    stands,
+)
 
-_CLOSER_LOOKS = 2
+_CLOSER_LOOKS = 4
 
 
 class Look(NamedTuple):
@@ -28,12 +40,12 @@ class Look(NamedTuple):
     search: Competition
     chosen: list[Group]
     named: tuple[Named, ...]
+    solution: Solution | None = None
 
 
 def looked_closely(
     first: Competition,
     unsettled: Sequence[Recording],
-    noise: dict[str, Noise],
     without: frozenset[str],
     say: Callable[[str], None],
     crew: Crew,
@@ -43,41 +55,107 @@ def looked_closely(
     unsettled: the recordings before the joint's edges were put where they are.
     """
     found = first.judge.select(until=lambda group: moves_joint(first, group))
-    look = rough = Look(first, found, all_named(first, found))
+    look = plain = Look(first, found, all_named(first, found))
+    known, moved = plain, ()
+    refused: frozenset[tuple[str, str]] = frozenset()
     for _ in range(_CLOSER_LOOKS):
-        if not look.chosen:
+        if not known.chosen and not moved:
             break
         say("once more, along the motion and at the place where the joint is now known to be")
-        rough = look
-        search = _under(rough.chosen, first, unsettled, noise, without, crew)
-        chosen = search.judge.select(search.judge.reshaped(search.kept))
-        at_size = remeasured(search, chosen, rough.named, search.moved) if search.moved else ()
+        search = _under(known, moved, first, unsettled, without, refused, crew)
+        chosen = search.judge.select(search.judge.reshaped(search.kept), until=lambda group: group.is_slope)
+        solution = solve([*search.judge.base, *chosen], search.evidence.sums)
+        at_size = remeasured(search, solution, known.named, search.moved) if search.moved else ()
         look = Look(search, chosen, at_size + all_named(search, chosen))
         gone = {(one.name, one.acts_on) for one in at_size if not stands(one, search.evidence.recordings[0])}
-        if not gone:
+        if gone:  # at its size it is nothing
+            if known.search is not first:
+                refused |= gone
+            moved = tuple(one for one in moved if (one[0].name, one[1]) not in gone)
+            left = [group for group in known.chosen if group.key not in gone]
+            named = tuple(one for one in known.named if (one.name, one.acts_on) not in gone)
+            look = known = Look(known.search, left, named)
+            plain = known if known.search is first else plain
+        elif any(group.is_slope for group in chosen):
+            look = known = _of_best_form(look, unsettled, crew)
+            moved = moved_now(search, known.chosen)  # both at their sizes
+        else:
             break
-        found = [group for group in rough.chosen if group.key not in gone]  # at its size it is nothing
-        look = rough = Look(first, found, all_named(first, found))
     before = excess(first, [])
-    if unknown_rest(look.search, look.chosen, before) and not unknown_rest(first, rough.chosen, before):
-        return rough  # the first look had reached the floor
-    return look
+    if unknown_rest(look.search, look.chosen, before) and not unknown_rest(first, plain.chosen, before):
+        look = plain  # the first look had reached the floor
+    return _measured(look)
+
+
+def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Look:
+    """Return a look with each slope as the law that leaves least at its size: a delay and a lag begin alike."""
+    search, chosen, named = look.search, list(look.chosen), look.named
+    for k, group in enumerate(look.chosen):
+        if not group.is_slope:
+            continue
+        rest = [*chosen[:k], *chosen[k + 1 :]]
+        least = search.judge.gain(chosen) - ALIAS_GAIN
+        forms = [group]
+        for other in search.judge.rivals(rest):
+            same = other.is_slope and other.key[1] == group.key[1] and other.key[0] != group.key[0]
+            if same and search.judge.gain([*rest, other]) > least:
+                forms.append(other)
+        left = [_left_under(search, [*rest, form], unsettled, crew) for form in forms] if len(forms) > 1 else [0.0]
+        best = left.index(min(left))
+        gone = {form.key for form, more in zip(forms, left, strict=True) if more > left[best] + ALIAS_GAIN}
+        search.judge.trace.append(
+            "at their sizes: "
+            + "; ".join(f"{form.key} leaves {more:.0f}" for form, more in zip(forms, left, strict=True))
+        )
+        chosen[k] = forms[best]
+        named = (*(one for one in named if (one.name, one.acts_on) != group.key), *_named_as(look, chosen, k, gone))
+    return Look(search, chosen, named)
+
+
+def _named_as(look: Look, chosen: list[Group], k: int, gone: set[tuple[str, str]]) -> tuple[Named, ...]:
+    """Return one of `chosen` in words, without the aliases that are `gone`."""
+    return tuple(
+        replace(one, aliases=tuple(alias for alias in one.aliases if alias[:2] not in gone))
+        for one in all_named(look.search, chosen)
+        if (one.name, one.acts_on) == chosen[k].key
+    )
+
+
+def _left_under(search: Competition, chosen: list[Group], unsettled: Sequence[Recording], crew: Crew) -> float:
+    """Return what is left above the noise with all that moves the joint at its size."""
+    moving = [group for group in chosen if moves_readings(search, group) or changes_commands(search, group)]
+    moved = (*moved_now(search, chosen), *(moved_by(search, chosen, group) for group in moving))
+    beside = tuple(search.term(group) for group in chosen if group not in moving)
+    return left_at_size(unsettled, search.noise, moved, beside, crew)
+
+
+def _measured(look: Look) -> Look:
+    """Return a look with every shape at its best, and deviations that hold what shapes are uncertain by."""
+    search = look.search
+    chosen, solution = at_best_shapes(search, look.chosen)
+    named = measured(search, chosen, solution, look.named)
+    moved = {(effect.name, place) for effect, place, _ in search.moved}
+    at_size = tuple(one for one in named if (one.name, one.acts_on) in moved)
+    others = tuple(one for one in named if (one.name, one.acts_on) not in moved)
+    return Look(search, chosen, remeasured(search, solution, at_size, search.moved) + others, solution)
 
 
 def _under(
-    known: list[Group],
+    known: Look,
+    moved: tuple[Moved, ...],
     first: Competition,
     unsettled: Sequence[Recording],
-    noise: dict[str, Noise],
     without: frozenset[str],
+    refused: frozenset[tuple[str, str]],
     crew: Crew,
 ) -> Competition:
-    """Make the competition along the motion that `known` effects make, at the place where they put the joint."""
-    motion = moved_under(known, first, unsettled, noise, crew)
+    """Make the competition along the motion that known effects make, at the place where they put the joint."""
+    motion = moved_under(known.chosen, moved, known.search, unsettled, crew)
     search = Competition(
         motion.recordings,
         first.judge.training_count,
         without=without,
+        refused=refused,
         moved=motion.moved,
         kept=motion.kept,
         noise=noise_of(motion.recordings, motion.explained),

@@ -1,6 +1,7 @@
 """What was chosen, in words and numbers: effects by name, known parameters by their errors. Pure."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,8 +12,9 @@ from stagectl.gap.competition import Competition
 from stagectl.gap.findings import Named, ParameterError
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Solution, solve
+from stagectl.gap.quantities import along_motion, in_order, quantities
 from stagectl.gap.recording import Recording
-from stagectl.gap.settling import settled_by
+from stagectl.gap.settling import power_of_size, settled_by
 
 
 def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
@@ -24,16 +26,13 @@ def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
         term = search.term(group)
         if term.acts_on == "parameter":
             continue
-        values, sds = solution.of(group)
         rest = judge.gains([other for other in chosen if other is not group])
-        parameters, errors = _readable(term, values, sds, _places(solution, group))
-        if term.linear:
-            parameters, errors = _in_true_force(search, solution, term, parameters, errors)
+        parameters, errors = _sized(search, solution, group)
         found.append(
             Named(
                 name=term.name,
                 acts_on=term.acts_on,
-                parameters=parameters if not term.linear else term.shape | parameters,
+                parameters=parameters,
                 sds=errors,
                 gain=whole[0] - rest[0],
                 held_out_gain=whole[1] - rest[1],
@@ -41,6 +40,32 @@ def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
             )
         )
     return tuple(found)
+
+
+def measured(
+    search: Competition, chosen: Sequence[Group], solution: Solution, named: Sequence[Named]
+) -> tuple[Named, ...]:
+    """Return names of `chosen` with the parameters and deviations of a solution; others as they are."""
+    groups = {group.key: group for group in chosen}
+    found = []
+    for one in named:
+        group = groups.get((one.name, one.acts_on))
+        if group is None:
+            found.append(one)
+        else:
+            parameters, sds = _sized(search, solution, group)
+            found.append(replace(one, parameters=parameters, sds=sds))
+    return tuple(found)
+
+
+def _sized(search: Competition, solution: Solution, group: Group) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the parameters of an effect, and the deviations of those that were solved for."""
+    term = search.term(group)
+    parameters, errors = _readable(term, *solution.of(group), _places(solution, group))
+    if not term.linear and term.is_slope:
+        return parameters, errors
+    parameters, errors = _in_true_force(search, solution, term, parameters, errors)
+    return (term.shape | parameters if term.linear else parameters), errors
 
 
 _MOTOR_QUANTITIES = {
@@ -70,7 +95,9 @@ def _in_true_force(
     A motion shows forces over masses: with a mass that is e too large in truth every force is, and the masses are known
     to what is stated of them and of the force constants. Levels came out 0.3 to 1.2 % off, eight deviations. What is
     a share of a known force is as large as that one is: a loop of the contact came out 1.7 % off beside a stiffness
-    that is as much too small, and a law that holds the mass itself needs no other.
+    that is as much too small, and a law that holds the mass itself needs no other. A size that is no factor moves by
+    the power of it that the law follows: what saturates with the square of a motor's force, by 1.5 times what the force
+    constant is off by.
     """
     if term.acts_on.endswith(("_sensor", "_command", "contact_edge")):
         return parameters, errors
@@ -83,7 +110,11 @@ def _in_true_force(
     for quantity in quantities:
         motor = _MOTOR_QUANTITIES.get(quantity)
         if motor is not None:
-            weights[f"{side if motor == 'own' else motor}_force_constant"] = -1.0
+            power = 1.0 if term.linear else _power_of_motor(search, term, quantity)
+            weights[f"{side if motor == 'own' else motor}_force_constant"] = -power
+    if weights and not term.linear:
+        power = power_of_size(term, search.evidence.recordings)
+        weights = {name: weight / power for name, weight in weights.items()}
     columns = {
         known.name: group.columns[0]
         for (known, _), group in zip(search.parameters, search.judge.base, strict=False)
@@ -95,6 +126,24 @@ def _in_true_force(
     off, uncertain = float(vector @ solution.values), float(np.sqrt(max(vector @ solution.covariance @ vector, 0.0)))
     scaled = {name: value * (1.0 + off) if name in errors else value for name, value in parameters.items()}
     return scaled, {name: float(np.hypot(sd, scaled[name] * uncertain)) for name, sd in errors.items()}
+
+
+_SCALED_RATIO = 0.01
+
+
+def _power_of_motor(search: Competition, term: Term, quantity: str) -> float:
+    """Return the power of a motor's force, or current, that a law at its size follows."""
+    effect, axis = CATALOGUE[term.name], "macro" if term.acts_on.startswith("macro") else "end"
+    squares = []
+    for factor in (1.0, 1.0 + _SCALED_RATIO):
+        total = 0.0
+        for recording in search.evidence.recordings:
+            known = quantities(recording, axis, term.acts_on)
+            scaled = {**known, quantity: factor * known[quantity]}
+            values = [scaled[name] for name in effect.quantities]
+            total += float(np.sum(along_motion(effect, values, in_order(effect, term.shape)) ** 2))
+        squares.append(total)
+    return 0.5 * float(np.log(squares[1] / squares[0]) / np.log1p(_SCALED_RATIO)) if min(squares) > 0.0 else 1.0
 
 
 def _places(solution: Solution, group: Group) -> list[str]:

@@ -46,6 +46,7 @@ class Group:
     bounds: tuple[tuple[float, float], ...] = ()  # of each amplitude; a friction that drives is no friction
     searched: int = 0  # shape parameters that a grid or a spectrum chose
     places_count: int = 1  # sessions or runs that have amplitudes of their own
+    is_slope: bool = False  # what held-out recordings say of it is asked at its size
 
     @property
     def complexity(self) -> int:
@@ -61,7 +62,7 @@ class Solution:
     slots: tuple[tuple[int, str], ...]  # (column, "" or the session or run that it is of)
     values: np.ndarray
     covariance: np.ndarray
-    gain: float
+    gain: float  # over none of them, and over what is fixed
 
     def of(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
         """Return values and standard deviations of one group, sessions one after the other."""
@@ -76,11 +77,11 @@ class Solution:
         return float(self.values[places].sum()), float(np.sqrt(max(variance, 0.0)))
 
 
-def solve(groups: Sequence[Group], sums: Sequence[Sums]) -> Solution:
-    """Solve the amplitudes of `groups` on all of `sums`."""
+def solve(groups: Sequence[Group], sums: Sequence[Sums], fixed: Sequence[int] = ()) -> Solution:
+    """Solve the amplitudes of `groups` on all of `sums`; columns that are `fixed` stand beside them at 1."""
     slots, precision = active_slots(groups, sums)
     size = len(slots)
-    normal, right = normal_of(slots, precision, sums)
+    normal, right = normal_of(slots, precision, sums, fixed)
     if not size:
         return Solution(tuple(groups), (), np.zeros(0), np.zeros((0, 0)), 0.0)
     scale = np.sqrt(np.diag(normal))
@@ -209,7 +210,7 @@ def _right(s: Sums, on_noise: bool) -> np.ndarray:
 
 
 def normal_of(
-    slots: Sequence[tuple[int, str]], precision: Sequence[float], sums: Sequence[Sums]
+    slots: Sequence[tuple[int, str]], precision: Sequence[float], sums: Sequence[Sums], fixed: Sequence[int] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix, priors included, and the right side of some amplitudes."""
     normal, right = np.diag(np.array(precision, float)), np.zeros(len(slots))
@@ -217,7 +218,7 @@ def normal_of(
         here = [k for k, (_, scope) in enumerate(slots) if covers(scope, s)]
         columns = [slots[k][0] for k in here]
         normal[np.ix_(here, here)] += s.gram[np.ix_(columns, columns)]
-        right[here] += s.gram[columns, 0]
+        right[here] += s.gram[columns, 0] - s.gram[np.ix_(columns, list(fixed))].sum(axis=1)
     return normal, right
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 
 from stagectl.effects import Effect
-from stagectl.gap.believed import BelievedJoint
 from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.contact import contact_at, contact_damping_n_s_per_m
 from stagectl.gap.forces import Forces
@@ -11,6 +10,9 @@ from stagectl.gap.quantities import along_motion, quantities
 from stagectl.gap.recording import Recording, contact_of, relative_motion
 
 _READING_PASSES = 2
+
+SMALL_M = 1e-9
+"""Shift of an edge that slopes are taken over."""
 
 
 def reading_error_m(
@@ -50,11 +52,10 @@ def misread(recording: Recording, axis: str, error_m: np.ndarray, whole: bool) -
         fine_m = _between_samples(sampled_m if axis == "end" else -sampled_m, PARTS_COUNT)
         slope = np.gradient(fine_m.ravel(), recording.log.period_s / PARTS_COUNT).reshape(fine_m.shape)
         spring_n = joint.spring_n_per_m * fine_m + joint.damping_n_s_per_m * slope
-        forces.end_n = spring_n + more_contact_n(recording, joint, fine_m, slope)
+        forces.end_n = spring_n + more_contact_n(recording, fine_m, slope)
     else:
-        left = np.where(recording.side < 0.0, joint.left_stiffness_n_per_m, 0.0)
-        right = np.where(recording.side > 0.0, joint.right_stiffness_n_per_m, 0.0)
-        forces.end_n = (joint.spring_n_per_m + left + right) * _between_samples(away_m[:, 0], PARTS_COUNT)
+        slope_n_per_m = joint.spring_n_per_m + more_contact_n(recording, SMALL_M, 0.0) / SMALL_M
+        forces.end_n = slope_n_per_m * _between_samples(away_m[:, 0], PARTS_COUNT)
     forces.macro_n = -forces.end_n
     return forces
 
@@ -68,15 +69,15 @@ def _between_samples(values: np.ndarray, parts: int) -> np.ndarray:
 
 def more_contact_n(
     recording: Recording,
-    joint: BelievedJoint,
     apart_m: np.ndarray | float,
     apart_m_per_s: np.ndarray | float,
     left_out_m: np.ndarray | float = 0.0,
     right_out_m: np.ndarray | float = 0.0,
 ) -> np.ndarray:
     """Return by how much the contact pushes the end more with x_b larger by `apart_m`, and edges moved outward."""
-    if recording.end is None:
-        raise KeyError("end")
+    joint = recording.believed.joint
+    if recording.end is None or joint is None:
+        raise KeyError("joint")
     x_b, x_b_rate = relative_motion(recording)
     damping = contact_damping_n_s_per_m(recording.believed)
     left_m, right_m = recording.edges_out_m

@@ -19,6 +19,7 @@ from stagectl.gap.grids import free_shapes
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Placed, active_slots, covers, normal_of
 from stagectl.gap.reading_errors import moved_m
+from stagectl.gap.recording import Recording
 
 _SWEEPS = 2
 _MOST_SWEEPS = 7
@@ -88,6 +89,7 @@ class Refiner:
         entire = whole_of(term)
         if not free and not entire:
             return None
+        slope, moves = term, entire and term.acts_on.endswith(("_sensor", "contact_edge"))
         if entire:
             term = self._at_size(term)
             free = tuple(dict.fromkeys((*CATALOGUE[term.name].parameters[:1], *free)))
@@ -99,11 +101,13 @@ class Refiner:
                 shape, best = self._line(term, shape, name, best, 2.0 if entire and not sweep else 0.4**sweep)
             if sweep + 1 >= _SWEEPS and not best - before > _SWEPT_GAIN:
                 break
-        found = _with_shape(term, shape)
+        found = with_shape(term, shape)
+        if moves and self._is_beside_slopes and self._free_gain(slope) > best:
+            found = replace(slope, is_slope=True)  # its size is found together with theirs
         if Trait.LATE_READING in CATALOGUE[found.name].traits and not found.linear:
             # what a latch may be off by is no effect of a sensor
             stated_s = LATCH_SDS * self._evidence.recordings[0].belief(_axis(found)).latch_sd_s
-            least = stated_s / shape[CATALOGUE[found.name].parameters[0]]
+            least = stated_s / found.shape[CATALOGUE[found.name].parameters[0]]
             found = replace(found, bounds=((max(found.bounds[0][0], least), found.bounds[0][1]),))
         return found, len(free) - (0 if found.linear else 1)
 
@@ -144,32 +148,12 @@ class Refiner:
         self, term: Term, shape: dict[str, float], name: str, best: float, narrow: float
     ) -> tuple[dict[str, float], float]:
         """Search one parameter of the shape near where it is."""
-        effect = CATALOGUE[term.name]
-        at = shape[name]
-        low, high = effect.bounds[name]
-        if name == "pitch_m":
-            span = max(float(np.ptp(r.position_m(_axis(term)))) for r in self._evidence.recordings)
-            reach = narrow * _PITCH_SPANS * at * at / span
-            low, high = max(low, at - reach), min(high, at + reach)
-        elif name == effect.period == "frequency_hz":
-            reach = narrow * 0.5 / max(r.log.samples_count * r.log.period_s for r in self._evidence.recordings)
-            low, high = max(low, at - reach), min(high, at + reach)
-        elif name == "anchor_m":
-            low, high = max(low, at - _ANCHOR_M), min(high, at + _ANCHOR_M)
-        else:
-            factor = _BRACKET**narrow
-            reach = narrow * _NEAR_ZERO * (high - low)  # of a shape that may be zero, factors lead nowhere
-            sized = (
-                name == effect.parameters[0] and not term.linear
-            )  # found by trials: its sign and its decade are known
-            by_factor = sized or abs(at) > reach or low >= 0.0
-            ends = sorted((at / factor, at * factor)) if by_factor else (at - reach, at + reach)
-            low, high = max(low, ends[0]), min(high, ends[1])
+        low, high = reach_of(self._evidence.recordings, replace(term, shape=shape), name, narrow)
         if not high > low:
             return shape, best
 
         def loss(value: float) -> float:
-            return -self._gain(_with_shape(term, shape | {name: float(value)}))
+            return -self._gain(with_shape(term, shape | {name: float(value)}))
 
         outcome = minimize_scalar(
             loss,
@@ -180,6 +164,19 @@ class Refiner:
         if -outcome.fun > best:
             return shape | {name: float(outcome.x)}, float(-outcome.fun)
         return shape, best
+
+    @property
+    def _is_beside_slopes(self) -> bool:
+        """Tell whether beside it the size of something that moves readings or edges is known as a slope."""
+        return any(
+            hypotheses.is_deviation(term) and term.acts_on.endswith(("_sensor", "contact_edge"))
+            for term in self._terms.values()
+        )
+
+    def _free_gain(self, term: Term) -> float:
+        """Return what a term's columns gain at the amplitudes that are best."""
+        normal, right = self._reduced(self._evidence.columns_of(term), term)
+        return float(right @ self._solved(normal, right))
 
     def _gain(self, term: Term, columns_of: Callable[[Term], Columns] | None = None) -> float:
         """Return what a term gains beside the others; at its size without any freedom of its own."""
@@ -258,6 +255,29 @@ def scopes_of(scope: str, sums: Sequence[Placed]) -> tuple[str, ...]:
     return ("",)
 
 
+def reach_of(recordings: Sequence[Recording], term: Term, name: str, narrow: float) -> tuple[float, float]:
+    """Return within what one parameter of a shape is searched about where it is; `narrow` falls from 1 on."""
+    effect = CATALOGUE[term.name]
+    at = term.shape[name]
+    low, high = effect.bounds[name]
+    if name == "pitch_m":
+        span = max(float(np.ptp(r.position_m(_axis(term)))) for r in recordings)
+        reach = narrow * _PITCH_SPANS * at * at / span
+        return max(low, at - reach), min(high, at + reach)
+    if name == effect.period == "frequency_hz":
+        reach = narrow * 0.5 / max(r.log.samples_count * r.log.period_s for r in recordings)
+        return max(low, at - reach), min(high, at + reach)
+    if name == "anchor_m":
+        reach = narrow * _ANCHOR_M
+        return max(low, at - reach), min(high, at + reach)
+    factor = _BRACKET**narrow
+    reach = narrow * _NEAR_ZERO * (high - low)  # of a shape that may be zero, factors lead nowhere
+    sized = name == effect.parameters[0] and not term.linear  # found by trials: its sign and its decade are known
+    by_factor = sized or abs(at) > reach or low >= 0.0
+    ends = sorted((at / factor, at * factor)) if by_factor else (at - reach, at + reach)
+    return max(low, ends[0]), min(high, ends[1])
+
+
 def whole_of(term: Term) -> bool:
     """Tell whether an effect has to be taken at its size: its column is only the beginning of what it does."""
     if term.acts_on == "parameter":
@@ -273,8 +293,9 @@ def _axis(term: Term) -> str:
     return "macro" if term.acts_on.startswith("macro") else "end"
 
 
-def _with_shape(term: Term, shape: dict[str, float]) -> Term:
-    effect = CATALOGUE[term.name]
+def with_shape(term: Term, changed: dict[str, float]) -> Term:
+    """Return a term with some of its shape changed."""
+    effect, shape = CATALOGUE[term.name], term.shape | changed
     if term.linear:
         return hypotheses.term_of(effect, term.acts_on, shape)
     return hypotheses.term_at_size(effect, term.acts_on, shape)

@@ -307,7 +307,13 @@ class Judge:
         return any(self.gain([*chosen, curve]) - now > CURVE_GAIN * self.threshold for curve in self.curves)
 
     def _foretells(self, chosen: Sequence[Group], more: Sequence[Group]) -> bool:
-        """Tell whether held-out recordings do not speak against what comes on top."""
+        """Tell whether held-out recordings do not speak against what comes on top.
+
+        Of two bodies that are both late one slope, along which no contact moves, is far from where both are: a
+        recording that grazes an edge foretells another size there (67 us of 249) than at the place itself.
+        """
+        if any(group.is_slope for group in more):
+            return True
         return self.foretold([*chosen, *more]) - self.foretold(chosen) > -CONTRADICTION
 
     def _threshold_of(self, group: Group) -> float:

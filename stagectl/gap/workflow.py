@@ -106,8 +106,8 @@ def _found(
     judge.calibrate()
     say("effects compete")
     before = judge.reducible_before()
-    look = looked_closely(first, unsettled, noise, without, say, crew)
-    solution = solve([*look.search.judge.base, *look.chosen], look.search.evidence.sums)
+    look = looked_closely(first, unsettled, without, say, crew)
+    solution = look.solution or solve([*look.search.judge.base, *look.chosen], look.search.evidence.sums)
     named, widths = without_widths(look.named, look.search)
     doubtful = (*friction_that_drives(named, look.search.evidence.recordings), *second_pitches(named))
     gone = {(one.name, one.acts_on) for one in doubtful}
