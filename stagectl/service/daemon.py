@@ -52,8 +52,9 @@ def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
     loop = StageLoop(settings, desk, log, remembered, notifier, figures)
     hear_signals(loop)
     listener = Listener(sockets)
-    listener.start()
     keep_for_good()
+    loop.show()  # whoever asks first is answered
+    listener.start()
     notifier.say(READY=1, STATUS="listening")
     try:
         loop.run()

@@ -85,9 +85,14 @@ class StageState:
         self._heed_record_requests()
         self._look_at_joint()
         self._say_news()
+        status = self.show()
+        self._notifier.feed(status.health.cycles_count if self._stage is not None else time.monotonic_ns())
+
+    def show(self) -> messages.Status:
+        """Publish where things stand."""
         status = self._view()
         self.desk.publish(status, self._state)
-        self._notifier.feed(status.health.cycles_count if self._stage is not None else time.monotonic_ns())
+        return status
 
     def _look_at_joint(self) -> None:
         """Follow the wear of a joint that works."""
