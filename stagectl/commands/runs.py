@@ -9,6 +9,7 @@ from rich.table import Table
 from stagectl import runs
 from stagectl.commands.answer import ENDED_EARLY, Answer, Voice
 from stagectl.errors import RecordError, RequestError
+from stagectl.left_memory import remove_left_blocks
 from stagectl.record import MANIFEST, read_run, recover_orphans
 from stagectl.run_folder import reserved
 from stagectl.signals import Stop, stop_sentence
@@ -47,6 +48,7 @@ def names(voice: Voice, runs_root: Path) -> Answer:
                 counts = f"{outcome.rows_count} rows of a dead servo recovered, {outcome.rows_lost_count} lost"
                 voice.note(f"{ring}: {counts}")
             recovered.append({"ring": ring, **asdict(outcome)})
+    remove_left_blocks()
     found = runs.list_runs(runs_root)
     table = Table("run", "state", "rows", "time", "profile", box=None, pad_edge=False, header_style="bold")
     for column in table.columns:

@@ -7,6 +7,7 @@ from importlib import metadata
 from pathlib import Path
 
 from stagectl.errors import RequestError
+from stagectl.left_memory import remove_left_blocks
 from stagectl.left_runs import finish_left_runs
 from stagectl.record import recover_orphans
 from stagectl.service.access import Access, read_tokens
@@ -47,6 +48,7 @@ def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
         log.say("listening", f"127.0.0.1:{listening.getsockname()[1]}, tokens in {tokens_path}")
     for ring, outcome in recover_orphans():
         log.say("recovered", str(outcome), ring=str(ring))
+    remove_left_blocks()
     for folder, outcome in finish_left_runs(settings.runs_root):
         log.say("recovered", str(outcome), run=folder.name)
     loop = StageLoop(settings, desk, log, remembered, notifier, figures)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +12,8 @@ from tests.service.daemon import servo_pid
 from tests.service.test_daemon import move_away
 
 pytestmark = pytest.mark.real_time
+
+SHARED_MEMORY = Path("/dev/shm")
 
 
 def test_a_killed_servo_is_a_fault_that_is_recovered_from(idle):
@@ -38,6 +41,21 @@ def test_a_killed_servo_is_a_fault_that_is_recovered_from(idle):
             client.arm()
         assert client.home().stop == "FINISHED"
         assert client.arm().stop == "FINISHED"
+
+
+def test_a_service_that_was_killed_whole_leaves_no_memory_to_the_next(idle):
+    """As systemd's watchdog or the kernel's OOM killer end it: nobody is left who could put anything away."""
+    servo, supervisor = servo_pid(idle), idle.process
+    blocks = f"stagectl-{supervisor.pid}-*"
+    os.kill(supervisor.pid, signal.SIGSTOP)
+    os.kill(servo, signal.SIGKILL)
+    supervisor.kill()
+    supervisor.wait()
+    assert len(list(SHARED_MEMORY.glob(blocks))) == 4
+    idle.socket.unlink()  # httpcore leaves a socket unclosed that was refused
+    idle.start()
+    idle.state_is("idle")
+    assert list(SHARED_MEMORY.glob(blocks)) == []
 
 
 def test_a_servo_that_hangs_is_noticed(idle):
