@@ -184,7 +184,7 @@ def _serve(config: dict[str, Any]) -> int:
         ring,
     )
     refused = make_real_time(config.get("cpu"))
-    if shared:
+    if shared and config.get("cpu") is not None:  # of one processor there is nothing to ask for
         refused.append(f"a CPU without the kernel's own work ({_KERNEL_WORK})")
     _say({"running": True, "refused": refused, "warnings": port.warnings})
     while port.read():  # lines that waited are old: their arrival says nothing
