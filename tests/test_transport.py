@@ -196,12 +196,9 @@ def test_a_line_that_the_kernel_has_not_handed_over_yet_holds_no_cycle_up(apart,
         assert busy.stdout is not None
         busy.stdout.readline()
         os.write(world.master, b"second")
-        begin_t_ns = world.transport.now_t_ns()
         held_back = [world.cycle().sensor_bytes for _ in range(10)]
-        took_ns = world.transport.now_t_ns() - begin_t_ns
         assert busy.poll() is None
     assert held_back == [b""] * 10
-    assert took_ns < 150 * MS  # 30 ms of cycles, and what a test host adds
     assert world.cycle().sensor_bytes == b"second"
     world.close()
 
