@@ -6,13 +6,13 @@ w is held for a period, j is how far a sample's instant is from the one that it 
 covariance that it carries along (Kalman 1960; Anderson, Moore, Optimal Filtering, chapter 4). q lies between two
 densities of the profile, by how far the innovations are from noise:
 
-    q^2 = q_0^2 + u (q_1^2 - q_0^2),  u = min(1, |r / (3.5 sigma_r)|^3)
+    q^2 = q_0^2 / l + u (q_1^2 - q_0^2 / l),  u = min(1, (r / (3.2 sigma_r))^4)
 
-r is their running mean over ten periods, each divided by how much louder than at standstill noise is at its speed
-(decision 0029), sigma_r what noise makes of r at rest. (A level of process noise that is adjusted: Bar-Shalom, Li,
-Kirubarajan, Estimation with Applications to Tracking and Navigation, section 11.2.) u is 0 at rest and 1 where a force
-moves the end: decision 0027. Inside, positions count in the sensor's noise, times in
-periods h, forces in m n / h^2. Pure.
+l is how much louder than at standstill noise is at a speed (decision 0029), r the running mean over 10 l^(1/3) periods
+of innovations over l, sigma_r what noise makes of r at rest. (A level of process noise that is adjusted: Bar-Shalom,
+Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 11.2.) u is 0 at rest and 1 where a
+force moves the end: decision 0027. Inside, positions count in the sensor's noise, times in periods h, forces in
+m n / h^2. Pure.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,7 @@ FIELDS = (
 """What a record that has such a filter holds of it."""
 
 _MEAN_SAMPLES = 10.0
-_FORCE_DEVIATIONS = 3.5  # of a mean of noise: one in two thousand is beyond them
+_FORCE_DEVIATIONS = 3.2  # of a mean of noise: one in seven hundred is beyond them
 
 _SETTLING_SAMPLES = 20_000  # within them the covariance stays what it is where the force noise is below some 0.1 N
 
@@ -107,7 +107,8 @@ def stiffening(samples_count: int) -> Callable[[np.ndarray], None]:
 
 
 def _settle(record: np.ndarray, unrest_ratio: float) -> None:
-    record["least_unrest_ratio"] = unrest_ratio
+    has_rest = record["filter_rest_walk"] < record["filter_walk"]  # a filter of one density has none
+    record["least_unrest_ratio"] = np.where(has_rest, unrest_ratio, 1.0)
     record["filter_mean_m"] = 0.0
     record["filter_covariance"] = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
     _stay(record[0])
@@ -132,10 +133,14 @@ def step(e: Record, innovation_m: float, velocity_m_per_s: float) -> None:
     """Take an innovation into the unrest, and bring covariance and gains to the sample that it came with."""
     jitter = velocity_m_per_s * e.filter_jitter_s_per_m
     noise = e.filter_noise + jitter * jitter
-    e.filter_mean_m += (innovation_m / np.sqrt(noise) - e.filter_mean_m) / _MEAN_SAMPLES
-    share = abs(e.filter_mean_m / e.filter_force_mean_m)
-    e.unrest_ratio = max(share * share * share if share < 1.0 else 1.0, e.least_unrest_ratio)  # nan: 1
-    walk = e.filter_rest_walk + e.unrest_ratio * (e.filter_walk - e.filter_rest_walk)
+    loudness = np.sqrt(noise)
+    samples = _MEAN_SAMPLES * np.cbrt(loudness)  # as a filter of one density slows down
+    e.filter_mean_m += (innovation_m / loudness - e.filter_mean_m) / samples
+    quieter = (2.0 * samples - 1.0) / (2.0 * _MEAN_SAMPLES - 1.0)  # the variance of a longer mean
+    share = (e.filter_mean_m / e.filter_force_mean_m) ** 2 * quieter
+    e.unrest_ratio = max(share * share if share < 1.0 else 1.0, e.least_unrest_ratio)  # nan: 1
+    rest_walk = e.filter_rest_walk / loudness  # adds the same share to the least error, n^(5/6) q^(1/6) to n^(3/4)
+    walk = rest_walk + e.unrest_ratio * (e.filter_walk - rest_walk)
     held = e.filter_held
     p = e.filter_covariance
     xd = p[2] + p[4] + 0.5 * p[5]  # A P A' of A = (1 1 1/2, 0 1 1, 0 0 1) ...

@@ -49,10 +49,17 @@ def test_both_ends_are_kalman_filters_and_stay_where_they_are(state, ratio):
 def test_without_a_ratio_it_is_one_filter_whatever_it_is_shown():
     record = made(rest_drift_ratio=1.0)
     before = gains(record)
-    for innovation_m in (0.0, 1e-6, -1e-3):
+    for innovation_m in (0.0, 1e-6, -1e-3, 0.0):
         one.step(record[0], innovation_m, 0.0)
-    np.testing.assert_allclose(gains(record), before, rtol=1e-9)
-    assert record["unrest_ratio"] == 1.0
+        np.testing.assert_allclose(gains(record), before, rtol=1e-9)
+        assert record["unrest_ratio"] == 1.0
+
+
+def test_without_a_ratio_only_the_noise_of_its_speed_makes_it_softer():
+    record = made(rest_drift_ratio=1.0, jitter_s=1e-6)
+    for _ in range(2000):
+        one.step(record[0], 0.0, 0.2)
+    np.testing.assert_allclose(gains(record), by_scipy(DRIFT, HELD_N, np.hypot(NOISE_M, 0.2e-6)), rtol=1e-3)
 
 
 def test_a_force_stiffens_it_within_thirty_samples_and_noise_does_not():
@@ -105,16 +112,35 @@ def test_jitter_is_noise_at_a_speed_and_no_force(velocity_m_per_s):
         one.step(record[0], innovation_m, velocity_m_per_s)
         unrest.append(float(record["unrest_ratio"][0]))
     assert np.mean(unrest) < 0.05
-    for _ in range(2000):
+    for _ in range(4000):
         one.step(record[0], 0.0, velocity_m_per_s)
-    np.testing.assert_allclose(gains(record), by_scipy(0.12 * DRIFT, HELD_N, noise_m), rtol=1e-3)
+    drift = 0.12 * DRIFT / np.sqrt(noise_m / NOISE_M)  # the louder, the softer
+    np.testing.assert_allclose(gains(record), by_scipy(drift, HELD_N, noise_m), rtol=1e-3)
     one.at_speed(velocity_m_per_s)(settled := made(jitter_s=jitter_s))
     one.step(settled[0], 0.0, 0.0)  # and stays so where nothing moves: a loop is linearised at rest
-    np.testing.assert_allclose(gains(settled), by_scipy(0.12 * DRIFT, HELD_N, noise_m), rtol=1e-4)
+    np.testing.assert_allclose(gains(settled), by_scipy(drift, HELD_N, noise_m), rtol=1e-4)
+
+
+def unrest(velocity_m_per_s: float, seed: int) -> np.ndarray:
+    """What white noise as loud as a speed makes it makes of u, 50 000 samples."""
+    record = made(jitter_s=1e-6)
+    noise_m = np.hypot(NOISE_M, velocity_m_per_s * 1e-6) * 1.1
+    found = []
+    for innovation_m in np.random.default_rng(seed).standard_normal(50_000) * noise_m:
+        one.step(record[0], innovation_m, velocity_m_per_s)
+        found.append(float(record["unrest_ratio"][0]))
+    return np.array(found)
+
+
+def test_noise_makes_no_more_unrest_at_a_speed_than_at_rest_and_longer_of_it():
+    still, fast = unrest(0.0, 7), unrest(0.2, 8)
+    assert np.mean(fast) == pytest.approx(np.mean(still), rel=0.3)
+    begun_still, begun_fast = (np.count_nonzero(np.diff(one_u > 0.1)) for one_u in (still, fast))
+    assert begun_fast < 0.75 * begun_still  # a mean 3.4 times as long crosses a level about half as often
 
 
 def test_a_force_stiffens_it_at_a_speed_too():
     record = made(jitter_s=1e-6)
-    for _ in range(30):
+    for _ in range(60):
         one.step(record[0], 3.0 * 200e-9, 0.2)
     assert record["unrest_ratio"] == 1.0
