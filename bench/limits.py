@@ -3,26 +3,31 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from bench import control_limit
 from bench.figure import Bar, Figure, judged
+from bench.following import rms
 from sim_backend.machine import Machine, load_machine
 from stagectl.budget import budget, lqg, shares
 from stagectl.budget.disturbances import noises_of
 from stagectl.budget.lqg import Surroundings
 from stagectl.linear_loop import machine_body
 from stagectl.profile import load_profile
+from stagectl.signals import SETPOINT
 
 HOLD = Bar("bound: hold at one cycle of delay, 5 nm, 5 mN", "nm")
 DRIFTING = Bar("bound: the same with a force that drifts by 16 mN/sqrt(s)", "nm")
 DELAY = "bound: peak for a step of 0.1 N at Ms 2, {cycles:g} cycles of delay"
 SUM = Bar("budget: sum of the sources off from the measured hold, worst seed, {law}", "%", 15.0)
 OVER = Bar("budget: hold of dsmc over the optimum at Ms 2.0", "1", 1.1)
-OVER_LATER = Bar("budget: the same at one cycle of delay", "1", 1.1)
+OVER_LATER = Bar("budget: the same at one cycle of delay, true end position for 60 s, worst run", "1", 1.1)
 OVER_AS_STIFF = Bar("budget: hold of dsmc over the optimum at Ms 2.0 of a loop that a force moves as little", "1", 1.1)
 LEAST = Bar("budget: optimum at Ms 2.0 for the profile's sensor, delay and torque step", "nm")
 
 _PROTOTYPE = {0.4: 16, 0.6: 22, 1.0: 35, 1.5: 56, 2.0: 81}  # nm, of a search over two gains
 _SEEDS = (1, 2, 3)
+_HOLD_S = 60.0
 _REALISTIC = Surroundings(40.0, 1e-3, 1e-3, 5e-9, 5e-3)
 
 
@@ -62,9 +67,18 @@ def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
 
 
 def _over_later(machine: Machine) -> Figure:
-    """Compute hold and optimum of the profile with a whole cycle of delay, at which control is judged."""
+    """Hold for a minute with a whole cycle of delay, at which control is judged, on machines that are 1 % wrong.
+
+    A hold of 8 s scatters by 2 % about its own root mean square, one of 60 s by less than 1 %.
+    """
     profile = control_limit.stage()
     noises = noises_of(profile, machine)
-    hold_m = shares.total_rms_m(profile, "dsmc", noises, machine_body(machine))
     least_m = budget.bounds_of(profile, noises, 1.0).robust.true_rms_m
-    return judged(OVER_LATER, hold_m / least_m, reason=f"{1e9 * hold_m:.2f} over {1e9 * least_m:.2f} nm")
+    computed_m = shares.total_rms_m(profile, "dsmc", noises, machine_body(machine))
+    rows = np.zeros(round(_HOLD_S * profile.cycle.rate_hz), SETPOINT)
+    held_m = [rms(one.error_m) for one in control_limit.runs(profile, "wrong", rows, control_limit.SEEDS)]
+    said = (
+        f"optimum {1e9 * least_m:.2f} nm; all runs together {1e9 * rms(np.array(held_m)):.2f} nm, computed for the "
+        f"softest gains {1e9 * computed_m:.2f} nm"
+    )
+    return judged(OVER_LATER, max(held_m) / least_m, list(control_limit.SEEDS), said)

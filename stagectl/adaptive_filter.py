@@ -9,7 +9,7 @@ densities of the profile, by how far the innovations are from noise:
     q^2 = q_0^2 / l + u (q_1^2 - q_0^2 / l),  u = min(1, (r / (3.2 sigma_r))^4)
 
 l is how much louder than at standstill noise is at a speed (decision 0029), r the running mean over 10 l^(1/3) periods
-of innovations over l, sigma_r what noise makes of r at rest. (A level of process noise that is adjusted: Bar-Shalom,
+of innovations over l, sigma_r what noise makes of that mean. (A level of process noise that is adjusted: Bar-Shalom,
 Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 11.2.) u is 0 at rest and 1 where a
 force moves the end: decision 0027. Inside, positions count in the sensor's noise, times in periods h, forces in
 m n / h^2. Pure.

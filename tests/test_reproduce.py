@@ -46,6 +46,16 @@ def test_the_terminal_shows_the_same_rows(capsys, tmp_path):
     assert re.search(r"50\.0 N\s+0 N", out)
 
 
+def test_every_number_is_whole_on_a_terminal_of_80_columns(capsys, tmp_path, monkeypatch):
+    """Cropped, 1.10 mm were 1.10 m."""
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = call(capsys, "reproduce", "model", "--out", tmp_path)
+    assert code == 0
+    for number in ("48.7 kA", "734 mA", "1.10 mm", "74.9 mm", "627 mHz"):
+        assert re.search(rf"(?<!\S){re.escape(number)}(?!\S)", out)
+    assert max(map(len, out.splitlines())) <= 80
+
+
 def test_a_section_that_is_not_there_is_wrong_usage(capsys, tmp_path):
     code, _, err = call(capsys, "reproduce", "9.9", "--out", tmp_path / "new")
     assert code == 2

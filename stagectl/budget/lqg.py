@@ -30,8 +30,10 @@ _LEAST_WALK_RATIO = 1e-5  # of the sensor's noise: a filter without any drift ha
 _LEAST_EFFORT = 1e-9  # squared: cheap control, not free
 _FREQUENCIES_COUNT = 300
 _LOWEST_RATIO = 1e-4  # of half the sampling rate
-_STARTS = ((0.01, 0.03), (0.003, 0.01))  # drift of a filter, price of force, in units of what the noise could be
-_SEARCH: Any = {"xatol": 1e-3, "fatol": 1e-5, "maxfev": 150}
+_STARTS = ((1.0, 0.01, 0.03), (1.0, 0.003, 0.01), (0.3, 0.01, 0.1))
+"""Force noise of a filter over the motor's; its drift, price of force, in units of what the sensor's noise could be."""
+_LEAST_FORCE = 1e-4  # of that unit: a motor without noise
+_SEARCH: Any = {"xatol": 1e-3, "fatol": 1e-5, "maxfev": 300}
 _SENSITIVITY_PRICE = 30.0
 _LIMIT_SLACK = 1.005
 _NO_LOOP = 1e2
@@ -344,12 +346,16 @@ def stiffest(around: Surroundings, max_sensitivity: float = 2.0) -> Loop:
 
 
 def _searched(around: Surroundings, max_sensitivity: float, size: Callable[[Loop], float]) -> Loop:
-    """Search the filter's force drift and the price of force for the least `size` (Nelder, Mead, several starts)."""
+    """Search force noise and drift of the filter and the price of force for the least `size` (Nelder, Mead).
+
+    A filter made for the 20 mN of a motor on 12 kg allowed 19.9 nm at Ms 2.0, one made for less 8.1 nm.
+    """
     typical_n = around.sensor_noise_m * around.mass_kg / around.period_s**2
+    units = np.array([max(around.force_noise_n, _LEAST_FORCE * typical_n), typical_n, typical_n])
 
     def made(place: np.ndarray) -> Loop:
-        drift_n, effort_n = (float(value) * typical_n for value in np.exp(np.clip(place, -30.0, 10.0)))
-        return Loop(around, Design(around.force_noise_n, drift_n / math.sqrt(around.period_s), effort_n))
+        force_n, drift_n, effort_n = (float(value) for value in np.exp(np.clip(place, -30.0, 10.0)) * units)
+        return Loop(around, Design(force_n, drift_n / math.sqrt(around.period_s), effort_n))
 
     def cost(place: np.ndarray) -> float:
         try:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from stagectl.commands.answer import Answer, Voice
 from stagectl.errors import RequestError
@@ -13,6 +14,9 @@ from stagectl.paper.page import cells, page
 from stagectl.paper.rows import Chapter
 
 PAGE = "paper.html"
+
+_LABEL_WIDTH = 12
+_NUMBER_WIDTH = 12  # words may be longer, and wrap
 
 
 def show(voice: Voice, section: str | None, out: Path) -> Answer:
@@ -50,12 +54,18 @@ def _make_folder(out: Path) -> None:
 
 
 def _table(chapter: Chapter) -> Table:
+    """Lay rows out with every number whole, 72 columns wide or wider; remarks stand under what they are of."""
+    rows = [[str(cell) for cell in cells(row)] for row in chapter.rows]
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="bold cyan")
-    table.add_column("paper", no_wrap=True)
-    table.add_column("what", min_width=24)
-    for name in ("paper's", "as printed", "corrected"):
-        table.add_column(name, justify="right", min_width=9)
-    table.add_column("remark", style="dim", ratio=1)
-    for row in chapter.rows:
-        table.add_row(*(str(cell) for cell in cells(row)))
+    table.add_column("paper", max_width=_LABEL_WIDTH)
+    table.add_column("what", ratio=1)
+    for place, name in enumerate(("paper's", "as printed", "corrected"), start=2):
+        longest = max((len(cells_of_row[place]) for cells_of_row in rows), default=0)
+        width = min(max(longest, len(name)), _NUMBER_WIDTH)
+        table.add_column(name, justify="right", width=width)
+    for equation, what, *numbers, remark in rows:
+        text = Text(what)
+        if remark:
+            text.append(f"\n{remark}", style="dim")
+        table.add_row(equation, text, *numbers)
     return table

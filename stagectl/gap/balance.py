@@ -43,17 +43,19 @@ def recording_of(
 
 
 def foretold_under(recording: Recording, forces: Forces, found: Forces | None = None) -> Recording:
-    """Return a recording with the motion that follows from its past and from the forces that are thought to act.
+    """Return a recording with the motion that follows from its past, forces and sensor errors that are thought to act.
 
     found: what of these drives a share of the mass that swings, besides what is believed.
     """
     log, believed = recording.log, recording.believed
     motions: list[Motion | None] = [None, None]
+    errors_m = forces.macro_sensor_m, forces.end_sensor_m
     for k, (axis, force_n) in enumerate(zip(AXES, (forces.macro_n, forces.end_n), strict=True)):
         if axis in recording.axes and force_n is not None:
+            read_m, error_m = recording.position_m(axis), errors_m[k]
             motions[k] = motion_under(
-                recording.motion(axis), recording.position_m(axis), log.valid, force_n, recording.mass_kg(axis),
-                log.period_s, recording.belief(axis).noise_m,
+                recording.motion(axis), read_m if error_m is None else read_m - error_m, log.valid, force_n,
+                recording.mass_kg(axis), log.period_s, recording.belief(axis).noise_m,
             )  # fmt: skip
     there = put_together(
         log, believed, motions[0] or recording.macro, motions[1],

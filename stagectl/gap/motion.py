@@ -37,6 +37,8 @@ class Motion:
     acceleration_m_per_s2: np.ndarray
     slow: np.ndarray
     at_samples: np.ndarray  # position, velocity, acceleration foretold for the samples themselves, shape (n, 3)
+    known_m: np.ndarray  # position with the samples, shape (n,)
+    sds_m: np.ndarray  # how well it is known before the samples and with them, shape (n, 2)
 
 
 def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motion:
@@ -61,7 +63,7 @@ def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motio
     wide = (np.convolve(slow, np.ones(3), "same") > 0.5) | (
         np.convolve(rests, np.ones(2 * _REST_REACH + 1), "same") > 0.5
     )
-    return Motion(position, velocity, acceleration, wide, np.column_stack([x, v, a]))
+    return Motion(position, velocity, acceleration, wide, np.column_stack([x, v, a]), x, np.full((x.size, 2), sensor_m))
 
 
 SLOW_FORCE_N = 0.05
@@ -93,8 +95,8 @@ def motion_under(
         gain, variance, spread_m_per_s = _certainty(samples, mass_kg, period_s, sensor_m, *doubt)
         corner_rad_per_s = doubt[1]
         outcome = filtered(position_m, valid, mean_n, early_n, gain, variance, mass_kg, period_s, corner_rad_per_s)
-        tried.append((*outcome, spread_m_per_s))
-    known, foretold, _, spread_m_per_s = min(tried, key=lambda one: one[2])
+        tried.append((*outcome, spread_m_per_s, np.column_stack([variance - sensor_m**2, gain[:, 0] * sensor_m**2])))
+    known, foretold, _, spread_m_per_s, variances_m2 = min(tried, key=lambda one: one[2])
     step_s = period_s / force_n.shape[1]
     acceleration = (force_n + known[:, 2:]) / mass_kg
     velocity = known[:, 1:2] + step_s * (np.cumsum(acceleration, axis=1) - 0.5 * acceleration)
@@ -104,7 +106,8 @@ def motion_under(
     unsure = np.min(np.abs(velocity), axis=1) < _UNSURE_SDS * spread_m_per_s
     unsure |= np.min(velocity, axis=1) * np.max(velocity, axis=1) <= 0.0  # where it turns round within the interval
     slow = rough.slow | (np.convolve(unsure, np.ones(3), "same") > 0.5)
-    return Motion(position, velocity, acceleration, slow, at_samples)
+    sds_m = np.sqrt(np.maximum(variances_m2, 0.0))
+    return Motion(position, velocity, acceleration, slow, at_samples, known[:, 0], sds_m)
 
 
 @functools.lru_cache(maxsize=_KEPT_COUNT)

@@ -44,7 +44,10 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
         known = {name: _at_samples(values) for name, values in known.items()}
         for place, name in enumerate(("position_m", "velocity_m_per_s", "acceleration_m_per_s2")):
             known[name] = motion.at_samples[:, place : place + 1]
+        place_m, sd_m = _at_readings(recording, axis)
         known |= {
+            "position_m": place_m[:, None],
+            "position_sd_m": sd_m[:, None],
             "t_s": (recording.log.start_s + recording.log.times_s)[:, None],
             "dt_s": np.full((recording.log.samples_count, 1), h),
         }
@@ -56,6 +59,24 @@ def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndar
         known["contact_side_ratio"] = recording.side
         known["contact_stiffness_n_per_m"] = side_stiffness_n_per_m(joint, recording.side)
     return known
+
+
+_MOVED_NOISES = 10.0
+"""Way from sample to sample, over the sensor's noise, beyond which a sample may say where it was taken: where a stage
+stands the noise of its readings would be explained by itself."""
+
+
+def _at_readings(recording: Recording, axis: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return where a body is at the samples, and how surely: as foretold; until its sensor's error is known with them.
+
+    An error that repeats every 0.3 um puts the foretold place 0.1 um off: 17.9 nm came out as 2.7 nm.
+    """
+    motion, found = recording.motion(axis), recording.found
+    foretold_m, rate_m_per_s, _ = motion.at_samples.T
+    error_m = found.macro_sensor_m if axis == "macro" else found.end_sensor_m
+    way_m = np.abs(rate_m_per_s) * recording.log.period_s
+    moves = (error_m is None) & (way_m > _MOVED_NOISES * recording.belief(axis).noise_m)
+    return np.where(moves, motion.known_m, foretold_m), np.where(moves, motion.sds_m[:, 1], motion.sds_m[:, 0])
 
 
 def in_order(effect: Effect, values: dict[str, float]) -> list[float]:
