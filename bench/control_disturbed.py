@@ -43,6 +43,7 @@ JITTER = "control, sample jitter {us:g} us rms, 0.2 m/s: rms at constant speed o
 JITTER_AS_STIFF = "control, sample jitter {us:g} us rms: the same over the optimum at Ms 2.0 as stiff"
 JITTER_UNTOLD = "control, sample jitter {us:g} us rms, and nobody told: over the bound"
 JITTER_PEAK = "control, sample jitter {us:g} us rms, contact-free, calibrated: peak"
+JITTER_WRONG = "control, sample jitter {us:g} us rms, contact-free, 1 % wrong: peak"
 
 _SENSITIVITY = 2.5
 _TWICE = 2.0
@@ -250,6 +251,12 @@ def _jitter(seeds: Sequence[int]) -> Iterator[Figure]:
         yield judged(Bar(JITTER_AS_STIFF.format(us=us), "1"), at_speed_m / best_m, used, said)
         yield judged(Bar(JITTER_UNTOLD.format(us=us), "1"), untold_m / least_m, used, f"{1e9 * untold_m:.1f} nm")
         yield judged(Bar(JITTER_PEAK.format(us=us), "nm"), limit.peak_nm(told), used)
+        wrong_nm, ignorant_nm = (
+            limit.peak_nm(limit.runs(one, "wrong", limit.trapezoid(), seeds, jitter_s=jitter_s))
+            for one in (profile, limit.stage())
+        )
+        said = f"nobody told: {ignorant_nm:.0f} nm; state jitter where the masses are calibrated"
+        yield judged(Bar(JITTER_WRONG.format(us=us), "nm"), wrong_nm, used, said)
 
 
 def _steady(one: limit.Run) -> np.ndarray:

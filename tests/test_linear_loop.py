@@ -196,6 +196,18 @@ def test_an_injected_sine_is_answered_as_computed(law, place, relative_m, observ
         assert abs(measured - computed) < 0.03 * abs(computed), (frequency_hz, measured, computed)
 
 
+@pytest.mark.parametrize("observer", [at_rest, in_motion])
+def test_it_is_answered_as_computed_at_one_cycle_of_delay_as_well(observer):
+    """Where control is judged, around the peak of its sensitivity."""
+    profile = with_values(load_profile("oled-printer"), cycle__actuation_delay_s=1e-3)
+    machine = load_machine("oled-printer")
+    for frequency_hz in (30.0, 46.0, 70.0):
+        measured, gain = answered(profile, machine, "dsmc", 0.0, frequency_hz, observer)
+        closed = linearise(profile, "dsmc", machine_body(machine), GAP, gain, observer).closed()
+        computed = closed.response(np.array([frequency_hz]), "micro_command_n", "micro_force_asked_n")[0]
+        assert abs(measured - computed) < 0.03 * abs(computed), (frequency_hz, measured, computed)
+
+
 @pytest.mark.parametrize("law", ["dsmc", "pid"])
 def test_commands_that_come_later_than_believed_are_answered_as_computed(law):
     profile, machine = load_profile("oled-printer"), load_machine("oled-printer")

@@ -40,8 +40,9 @@ def chapter() -> Chapter:
             "%",
             6.31,
             100.0 * (RIG_6_1.width_m / RIG_6_1_MEASURED_WIDTH_M - 1.0),
-            None,
-            "arithmetic: the printed edges make 0.2014 mm, and 0.187 mm was measured; rounded to 0.201 mm it is 7.5 %",
+            max(100.0 * abs(one.last.width_m / RIG_6_1.width_m - 1.0) for one in found[NOISES_M[-1]]),
+            "arithmetic: the printed edges make 0.2014 mm, and 0.187 mm was measured; rounded to 0.201 mm it is 7.5 %; "
+            "ours: of a known width, worst recording at 100 nm of noise",
         ),
         *(
             Row(
