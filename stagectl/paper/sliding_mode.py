@@ -121,6 +121,23 @@ def reaching_band_m_per_s(values: SlidingModeValues = CONTROL_5_3) -> float:
     return values.r / values.k
 
 
+def sliding_energy(sliding_m_per_s: np.ndarray, mass_kg: float) -> np.ndarray:
+    """Return V1 = m2 s^2 / 2 of (34), J."""
+    return 0.5 * mass_kg * sliding_m_per_s**2
+
+
+def adaptive_energy(
+    sliding_m_per_s: np.ndarray, doubt_n: np.ndarray, mass_kg: float, values: SlidingModeValues = CONTROL_5_3
+) -> np.ndarray:
+    """Return V2 = V1 + doubt^2 / (2 alpha) of (37); doubt (36): the estimated less the true bound of the force."""
+    return sliding_energy(sliding_m_per_s, mass_kg) + doubt_n**2 / (2.0 * values.alpha)
+
+
+def error_energy_m2(error_m: np.ndarray) -> np.ndarray:
+    """Return V3 = e^2 / 2 of (43)."""
+    return 0.5 * error_m**2
+
+
 @compiled
 def _surface(law: np.ndarray, e: float, rate: float, dt_s: float, out: np.ndarray) -> None:
     """Follow e'' + eta e' + gamma y(e) = 0, the motion on s' = 0 (semi-implicit Euler keeps its energy)."""

@@ -202,6 +202,7 @@ class _Proof:
 
 
 def _proof(law: np.ndarray) -> _Proof:
+    """Follow V2 and V3 along a run; their slopes (35), (38), (41), (42), (44) are those of the samples."""
     setting = Setting(
         LIMIT_S,
         plant_as_printed.DRIVE_WITHOUT_INDUCTANCE,
@@ -212,12 +213,12 @@ def _proof(law: np.ndarray) -> _Proof:
     run = cases.sliding("trapezoid", law, setting)
     s = run.sliding_m_per_s
     doubt = run.bound_n - _DISTURBANCE_N
-    v2 = 0.5 * TABLE_1.micro_mass_kg * s**2 + doubt**2 / (2.0 * CONTROL_5_3.alpha)
+    v2 = sliding_mode.adaptive_energy(s, doubt, TABLE_1.micro_mass_kg)
     band = sliding_mode.reaching_band_m_per_s()
     outside = np.abs(s[:-1]) >= band
     rises = np.diff(v2) > 0.0
     above = np.abs(run.error_m[:-1]) > (sliding_mode.error_bound_m() or 0.0)
-    grows = np.diff(run.error_m**2) > 0.0
+    grows = np.diff(sliding_mode.error_energy_m2(run.error_m)) > 0.0
     return _Proof(
         100.0 * float(np.mean(outside)),
         _share(rises, outside),
