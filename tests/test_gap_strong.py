@@ -1,6 +1,7 @@
 """Strong effects in the gap workflow: found where they are, at their size, without false names beside them."""
 
 import functools
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -10,8 +11,10 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses, seeds
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.competition import Competition
+from stagectl.gap.crew import Serial
 from stagectl.gap.curvature import at_best_shapes
 from stagectl.gap.evidence import Evidence
+from stagectl.gap.known_motion import moved_under
 from stagectl.gap.log import Log
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group, solve
@@ -209,6 +212,44 @@ def test_a_share_of_the_mass_is_as_uncertain_as_its_frequency_and_damping_make_i
     assert found["frequency_hz"] == pytest.approx(MODE_HZ, rel=3e-4)
     assert found["damping_ratio"] == pytest.approx(MODE_DAMPING, rel=0.01)
     assert sd > 2.0 * plain.of(chosen[0])[1][0]
+
+
+@pytest.mark.parametrize(("uneven", "least", "most"), [(0.0, 1.0, 1.6), (0.05, 5.0, 1e3)])
+def test_a_law_that_is_not_exact_is_as_uncertain_as_stretches_differ(uneven: float, least: float, most: float):
+    """A friction that is 5 % larger on one half of the way: stated alone it is 12 N s/m, give or take 0.02 %."""
+    true = 12.0
+
+    def rubbed_n(command_n: float, x: float, v: float) -> float:
+        return command_n - true * v * (1.0 + uneven * np.sign(x))
+
+    recordings = [balance.recording_of(_axis_under(rubbed_n, seed), AXIS) for seed in (1, 2)]
+    term = hypotheses.term_of(CATALOGUE["viscous_friction"], "macro_force", {})
+    search = Competition(recordings, 2, noise=slow_noise(AXIS, recordings[0]), kept=[term])
+    chosen, solution = at_best_shapes(search, search.kept)
+    mass = next(g for (known, _), g in zip(search.parameters, search.judge.base, strict=False) if "mass" in known.name)
+    (value,), (sd,) = solution.of(chosen[0])
+    (scale,), _ = solution.of(mass)
+    assert abs(value * (1.0 + scale) - true) < 3.0 * np.hypot(sd, true * solution.of(mass)[1][0])
+    assert least <= sd / solve([*search.judge.base, *chosen], search.evidence.sums).of(chosen[0])[1][0] < most
+
+
+def test_known_parameters_make_up_for_nothing_that_is_part_of_the_operating_point():
+    """Solved without a delay of 0.6 ms they did: half a newton of force noise, and four false names, beside it."""
+    delay_s = 0.6e-3
+    waiting = deque([0.0] * round(delay_s / (H / STEPS)))
+
+    def late_n(command_n: float, x: float, v: float) -> float:
+        waiting.append(command_n)
+        return waiting.popleft()
+
+    recordings = [balance.recording_of(_axis_under(late_n, seed), AXIS) for seed in (1, 2)]
+    term = hypotheses.term_at_size(CATALOGUE["command_delay"], "macro_command", {"delay_s": delay_s})
+    search = Competition(recordings, 2, noise=slow_noise(AXIS, recordings[0]), kept=[term])
+    motion = moved_under(search.kept, (), search, recordings, Serial())
+    (moved,) = motion.moved
+    assert moved[2]["delay_s"] == pytest.approx(delay_s, abs=10e-6)
+    added_n = [forces.macro_n for forces in map(motion.explained, motion.recordings)]
+    assert all(float(np.sqrt(np.mean(n**2))) < 0.01 for n in added_n if n is not None)  # 0.3 and 0.4 N
 
 
 def test_a_size_that_is_no_factor_follows_the_power_of_its_law():

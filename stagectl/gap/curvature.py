@@ -6,7 +6,7 @@ amplitudes together with the slopes of what was found over every shape that was 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -22,6 +22,7 @@ from stagectl.gap.operating_point import Moved
 from stagectl.gap.quantities import in_order
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import reach_of, with_shape
+from stagectl.gap.scatter import scattered
 
 _STEP_RATIO = 1e-4
 """Share of the range of a search that a slope is taken over."""
@@ -135,18 +136,23 @@ def _moved_on(moved: Moved, name: str, step: float, r: Recording) -> list[Forces
     return [total]
 
 
-def _jointly(search: Competition, chosen: Sequence[Group], slopes: Sequence[_Slope]) -> Solution:
-    """Solve amplitudes together with steps of all shapes; what was taken at its size stays as large as it is."""
+def _jointly(
+    search: Competition, chosen: Sequence[Group], slopes: Sequence[_Slope]
+) -> tuple[Solution, tuple[int, ...]]:
+    """Solve amplitudes together with steps of all shapes; what was taken at its size stays as large as it is.
+
+    Returns the columns of the latter, too.
+    """
     sized = [slope.sizes for slope in slopes if slope.sizes is not None]
     free = [group for group in chosen if not any(group is other for other in sized)]
     fixed = tuple(column for group in sized for column in group.columns)
     groups = [*search.judge.base, *free, *(slope.group for slope in slopes)]
-    return solve(groups, search.evidence.sums, fixed)
+    return solve(groups, search.evidence.sums, fixed), fixed
 
 
 def _stepped(search: Competition, chosen: Sequence[Group], slopes: Sequence[_Slope]) -> list[Group]:
     """Return groups at the shapes that their slopes ask for."""
-    solution = _jointly(search, chosen, slopes)
+    solution, _ = _jointly(search, chosen, slopes)
     found = []
     for group in chosen:
         term = search.term(group)
@@ -165,11 +171,9 @@ def _stepped(search: Competition, chosen: Sequence[Group], slopes: Sequence[_Slo
 
 
 def _with_slopes(search: Competition, chosen: Sequence[Group], slopes: Sequence[_Slope]) -> Solution:
-    """Return the amplitudes of groups with the covariance that they have beside the slopes."""
+    """Return the amplitudes of groups with the covariances that they have beside the slopes."""
     plain = solve([*search.judge.base, *chosen], search.evidence.sums)
-    if not slopes:
-        return plain
-    joint = _jointly(search, chosen, slopes)
+    joint, fixed = _jointly(search, chosen, slopes)
     at = {slot: k for k, slot in enumerate(joint.slots)}
     ratios = {slot: 1.0 for slot in plain.slots}
     for slope in slopes:
@@ -179,7 +183,7 @@ def _with_slopes(search: Competition, chosen: Sequence[Group], slopes: Sequence[
                 if column == slope.sizes.columns[0]:
                     at[column, scope] = at[slope.group.columns[0], scope]
                     ratios[column, scope] = slope.step / size
-    places = [at[slot] for slot in plain.slots]
-    weights = np.array([ratios[slot] for slot in plain.slots])
-    covariance = joint.covariance[np.ix_(places, places)] * np.outer(weights, weights)
-    return Solution(plain.groups, plain.slots, plain.values, covariance, plain.gain)
+    places = np.ix_(*2 * [[at[slot] for slot in plain.slots]])
+    weights = np.outer(*2 * [[ratios[slot] for slot in plain.slots]])
+    spread = tuple(one[places] * weights for one in scattered(search.evidence, joint, fixed))
+    return replace(plain, covariance=joint.covariance[places] * weights, scattered=spread)

@@ -5,7 +5,7 @@ then follows from the past. Pure.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from stagectl.effects import Trait
+from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap import balance
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Crew
@@ -44,7 +44,8 @@ def moved_under(
     """
     moving = [group for group in known if moves_readings(search, group) or changes_commands(search, group)]
     still = [group for group in known if group not in moving]
-    explained, driving = search.explained(still), search.explained(still, but=Trait.SWINGS)
+    others = [group for group in still if Trait.SWINGS not in _traits(group)]
+    explained, driving = search.explained(known, still), search.explained(known, others)
     search.evidence.forget_trials()
     there, moved, kept = settled(
         unsettled,
@@ -58,3 +59,7 @@ def moved_under(
             lambda r: balance.foretold_under(r, sum_of_forces(known_forces(r), explained(r)), driving(r)), there
         )
     return KnownMotion(there, moved, kept, explained)
+
+
+def _traits(group: Group) -> frozenset[Trait]:
+    return CATALOGUE[group.key[0]].traits if group.key[0] in CATALOGUE else frozenset()

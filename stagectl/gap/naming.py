@@ -123,7 +123,7 @@ def _in_true_force(
     vector = np.zeros(len(solution.slots))
     for name, column in columns.items():
         vector[[slot for slot, (number, _) in enumerate(solution.slots) if number == column]] = weights[name]
-    off, uncertain = float(vector @ solution.values), float(np.sqrt(max(vector @ solution.covariance @ vector, 0.0)))
+    off, uncertain = float(vector @ solution.values), solution.sd_of(vector)
     scaled = {name: value * (1.0 + off) if name in errors else value for name, value in parameters.items()}
     return scaled, {name: float(np.hypot(sd, scaled[name] * uncertain)) for name, sd in errors.items()}
 

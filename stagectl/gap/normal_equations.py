@@ -63,18 +63,23 @@ class Solution:
     values: np.ndarray
     covariance: np.ndarray
     gain: float  # over none of them, and over what is fixed
+    scattered: tuple[np.ndarray, ...] = ()  # covariances by how stretches of the recordings scatter, where asked for
 
     def of(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
         """Return values and standard deviations of one group, sessions one after the other."""
         places = [k for k, (column, _) in enumerate(self.slots) if column in group.columns]
-        return self.values[places], np.sqrt(np.maximum(np.diag(self.covariance)[places], 0.0))
+        return self.values[places], np.array([self.sd_of(one) for one in np.eye(len(self.slots))[places]])
+
+    def sd_of(self, weights: np.ndarray) -> float:
+        """Return the standard deviation of a weighted sum of all amplitudes: the largest of all that are known."""
+        variances = [float(weights @ one @ weights) for one in (self.covariance, *self.scattered)]
+        return float(np.sqrt(max(*variances, 0.0)))
 
     def total_of(self, groups: Sequence[Group]) -> tuple[float, float]:
         """Return the sum of the first amplitudes of some groups, and its standard deviation."""
         columns = {group.columns[0] for group in groups}
-        places = [k for k, (column, _) in enumerate(self.slots) if column in columns]
-        variance = float(self.covariance[np.ix_(places, places)].sum())
-        return float(self.values[places].sum()), float(np.sqrt(max(variance, 0.0)))
+        weights = np.array([float(column in columns) for column, _ in self.slots])
+        return float(weights @ self.values), self.sd_of(weights)
 
 
 def solve(groups: Sequence[Group], sums: Sequence[Sums], fixed: Sequence[int] = ()) -> Solution:

@@ -1,0 +1,58 @@
+"""What amplitudes are uncertain by where laws are only nearly right: how their scores scatter from stretch to stretch.
+
+    V = A^-1 (n / (n - 1) sum_s g_s g_s' + P) A^-1,   g_s = sum of x (z - x'v) over one stretch
+
+x are columns, z innovations in units of the noise, v the amplitudes, A = sum x x' + P the normal matrix with its priors
+P, n the number of stretches. Where noise is all that is left V is A^-1; where laws are not exact it is what an inexact
+model is uncertain by (Huber 1967, White 1982; by stretches: Liang, Zeger 1986). A scale of all forces that one payload
+told to 0.27 % was 1.7 % off, and a level that a bristle's damping was missing from 0.6 % at a stated 0.3 %. Pure.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stagectl.gap.evidence import INNOVATIONS, Evidence
+from stagectl.gap.normal_equations import Solution, active_slots, covers
+
+_STRETCHES_S = (0.25, 1.0, 4.0)
+"""What is missing may last as long as a reversal or as long as a move."""
+
+_LEAST_STRETCHES = 4
+"""Fewer tell nothing of their scatter."""
+
+
+def scattered(evidence: Evidence, solution: Solution, fixed: Sequence[int] = ()) -> tuple[np.ndarray, ...]:
+    """Return covariances of a solution's amplitudes by the scatter of stretches, one for each length of them.
+
+    fixed: columns that stand beside the amplitudes at 1.
+    """
+    precision = np.diag(active_slots(solution.groups, evidence.sums)[1])
+    found = []
+    for stretch_s in _STRETCHES_S:
+        scores = np.concatenate([_scores(evidence, k, solution, fixed, stretch_s) for k in range(len(evidence.sums))])
+        count = scores.shape[0]
+        if count >= _LEAST_STRETCHES:
+            spread = count / (count - 1.0) * scores.T @ scores + precision
+            found.append(solution.covariance @ spread @ solution.covariance)
+    return tuple(found)
+
+
+def _scores(
+    evidence: Evidence, recording: int, solution: Solution, fixed: Sequence[int], stretch_s: float
+) -> np.ndarray:
+    """Return the scores of the stretches of one recording, channels summed, shape (stretches, amplitudes)."""
+    origin, log = evidence.origins[recording], evidence.recordings[recording].log
+    stretches = max(round(log.samples_count * log.period_s / stretch_s), 1)
+    here = np.array([k for k, (_, scope) in enumerate(solution.slots) if covers(scope, origin)], dtype=int)
+    total = np.zeros((stretches, len(solution.slots)))
+    for channel in evidence.channels[recording]:
+        present, rows = channel.of([solution.slots[k][0] for k in here])
+        if rows is None:
+            continue
+        _, beside = channel.of(fixed)
+        left = channel.rows[INNOVATIONS] - solution.values[here[present]] @ rows
+        left = left if beside is None else left - beside.sum(axis=0)
+        parts = np.array_split(rows * left, stretches, axis=1)
+        total[:, here[present]] += np.stack([part.sum(axis=1) for part in parts])
+    return total
