@@ -8,11 +8,22 @@ into `docs/gap-results.json`.
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from bench import emps_figures, final_seeds, suite_figures
 from bench.blind_names import our_keys
-from bench.blind_sets import Job, Marked, generated, held_out, line, load_set, marked, searched, sets_folder
+from bench.blind_sets import (
+    Job,
+    Marked,
+    Searched,
+    generated,
+    held_out,
+    line,
+    load_set,
+    marked,
+    searched,
+    sets_folder,
+)
 from bench.figure import Bar, Figure, absent, judged
 from stagectl.gap.believed import Believed
 from stagectl.gap.crew import crew_of
@@ -31,9 +42,8 @@ PART_SEEDS = range(7001, 7061)
 PART_S = 780.0
 PART_LEFT_OUT_COUNT = 4
 LEFT_OUT_S = 100.0  # kept back of a part run's time for them
-FULL_COUNT = 720
+FULL_COUNT = 300  # drawn as the shares of the suite have it; then sets with nothing missing until there are so many:
 FULL_NULLS_COUNT = 150
-_BATCH_COUNT = 40
 SPEED_SEED = 7006  # it draws four runs of both axes
 _SPEED_RUNS_COUNT = 4
 _SPEED_WORKERS_COUNT = 2
@@ -112,18 +122,13 @@ def _full(say: Say) -> Iterator[Figure]:
     run = final_seeds.begin()
     say(f"run {run.number} over the final seeds; it is in the record from now on")
     done = run.kept()
-    count = FULL_COUNT
-    while True:
-        seeds = range(final_seeds.FIRST_SEED, final_seeds.FIRST_SEED + count)
-        jobs = [Job(seed, None, sets_folder(), keep=False) for seed in seeds if seed not in done]
-        for one in searched(jobs, os.cpu_count() or 1):
-            run.keep(one)
-            done[one.seed] = one
-            say(line(marked(one)))
-        nulls = sum(one.truth is not None and one.truth["kind"] == "null" for one in done.values())
-        if nulls >= FULL_NULLS_COUNT:
-            break
-        count += _BATCH_COUNT
+    end = final_seeds.FIRST_SEED + FULL_COUNT
+    _search_all(
+        [Job(seed, None, sets_folder(), keep=False) for seed in range(final_seeds.FIRST_SEED, end)], run, done, say
+    )
+    while missing := FULL_NULLS_COUNT - sum(_is_null(one) for one in done.values()):
+        seeds = range(end, end := end + missing)
+        _search_all([Job(seed, "null", sets_folder(), keep=False) for seed in seeds], run, done, say)
     found = [marked(done[seed]) for seed in sorted(done)]
     measured = [
         *suite_figures.suite(found, full=True),
@@ -132,6 +137,18 @@ def _full(say: Say) -> Iterator[Figure]:
     ]
     run.end(done, measured, time.monotonic() - begin_s)
     yield from measured
+
+
+def _search_all(jobs: Sequence[Job], run: final_seeds.FinalRun, done: dict[int, Searched], say: Say) -> None:
+    """Search those that are not done yet, and keep them."""
+    for one in searched([job for job in jobs if job.seed not in done], os.cpu_count() or 1):
+        run.keep(one)
+        done[one.seed] = one
+        say(line(marked(one)))
+
+
+def _is_null(one: Searched) -> bool:
+    return one.truth is not None and one.truth["kind"] == "null"
 
 
 def _marked(found: Iterable, say: Say) -> list[Marked]:
