@@ -180,6 +180,20 @@ def test_a_mass_that_swings_is_all_that_a_motion_leaves_that_knows_nothing_of_it
     assert left[0] < 4.0 * noise < min(left[1:])  # the ringing reaches the frequencies that noise is read off
 
 
+def test_a_search_of_shapes_that_depend_on_each_other_ends_where_they_are():
+    """From there a search line by line stays at 4 %: share, frequency and damping pull along a narrow valley."""
+    recordings = [balance.recording_of(_axis_under(_swinging(0.15, 18.8, 0.033), seed), AXIS) for seed in (1, 2)]
+    for recording in recordings:
+        balance.set_noise(recording, slow_noise(AXIS, recording))
+    evidence = Evidence(recordings)
+    evidence.finish(np.zeros(0), 0, 0)
+    off = {"share_ratio": 0.05, "frequency_hz": 20.0, "damping_ratio": 0.02}
+    outcome = Refiner(evidence, []).refined(hypotheses.term_at_size(CATALOGUE["flexible_mode"], "macro_force", off))
+    assert outcome is not None
+    true = {"share_ratio": 0.15, "frequency_hz": 18.8, "damping_ratio": 0.033}
+    assert outcome[0].shape == pytest.approx(true, rel=0.01)
+
+
 SHARE, MODE_HZ, MODE_DAMPING = 0.06, 22.0, 0.02
 
 

@@ -139,18 +139,23 @@ class Competition:
         """Return what a group stands for."""
         return self.evidence.terms[group.columns[0]]
 
-    def explained(self, chosen: Sequence[Group], added: Sequence[Group]) -> Explained:
-        """Return what known parameters and `added` effects add in a recording, at the sizes beside all of `chosen`.
+    @property
+    def known_parameters(self) -> list[Group]:
+        """Return the groups of known parameters."""
+        return self.judge.base[: len(self.parameters)]
 
-        added: those of `chosen` that are no part of the operating point. Beside them alone known parameters made up for
-        a delay of 0.6 ms: innovations along it were red, for which 0.5 N of force noise was taken.
+    def explained(self, chosen: Sequence[Group], added: Sequence[Group]) -> Explained:
+        """Return what `added` adds in a recording, at its sizes beside known parameters and all of `chosen`.
+
+        Solved without what is part of the operating point known parameters made up for it: a delay of 0.6 ms left
+        innovations red, for which 0.5 N of force noise was taken.
         """
         solution = solve([*self.judge.base, *chosen], self.evidence.sums)
         values = {
             (column, scope): float(value)
             for (column, scope), value in zip(solution.slots, solution.values, strict=True)
         }
-        terms = [(self.term(group), group) for group in (*self.judge.base[: len(self.parameters)], *added)]
+        terms = [(self.term(group), group) for group in added]
 
         def of(recording: Recording) -> Forces:
             scopes = ("", f"session {recording.log.session}", f"run {recording.log.name}")

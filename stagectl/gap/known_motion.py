@@ -44,8 +44,9 @@ def moved_under(
     """
     moving = [group for group in known if moves_readings(search, group) or changes_commands(search, group)]
     still = [group for group in known if group not in moving]
-    others = [group for group in still if Trait.SWINGS not in _traits(group)]
-    explained, driving = search.explained(known, still), search.explained(known, others)
+    parameters = search.known_parameters
+    explained = search.explained(known, [*parameters, *still])
+    driving = search.explained(known, [group for group in (*parameters, *still) if _drives(search.term(group))])
     search.evidence.forget_trials()
     there, moved, kept = settled(
         unsettled,
@@ -61,5 +62,6 @@ def moved_under(
     return KnownMotion(there, moved, kept, explained)
 
 
-def _traits(group: Group) -> frozenset[Trait]:
-    return CATALOGUE[group.key[0]].traits if group.key[0] in CATALOGUE else frozenset()
+def _drives(term: Term) -> bool:
+    """Tell whether what a term adds drives a share of the mass that swings; such a share does not."""
+    return term.name not in CATALOGUE or Trait.SWINGS not in CATALOGUE[term.name].traits

@@ -38,6 +38,12 @@ _EDGE_MOVED_M = (0.3e-6, 1e-6, 3e-6, *np.arange(5e-6, 60e-6, 5e-6), *np.geomspac
 """How far an edge may lie elsewhere. Its gain stands out no wider than contacts are deep, however far it has moved:
 10 um under 100 N. An edge 23 um out gained nothing at 10 and at 30 um, where half of all contact is another one."""
 
+_MOST_STEPS = 8
+_STEP_PARTS = (1.0, 0.3)
+_STEPPED_GAIN = 0.1
+_SLOPE_RATIO = 1e-4
+"""Share of the range of a search that a slope is taken over."""
+
 _TOLERANCE_RATIO = 3e-3
 _WORST = 1e300
 _LARGEST = 1e100
@@ -102,6 +108,8 @@ class Refiner:
             if sweep + 1 >= _SWEEPS and not best - before > _SWEPT_GAIN:
                 break
         found = with_shape(term, shape)
+        if not found.linear and found.scope == "structural":
+            found, best = self._stepped(found, free, best)
         if moves and self._is_beside_slopes and self._free_gain(slope) > best:
             found = replace(slope, is_slope=True)  # its size is found together with theirs
         if Trait.LATE_READING in CATALOGUE[found.name].traits and not found.linear:
@@ -165,6 +173,43 @@ class Refiner:
             return shape | {name: float(outcome.x)}, float(-outcome.fun)
         return shape, best
 
+    def _stepped(self, term: Term, free: Sequence[str], best: float) -> tuple[Term, float]:
+        """Return a term at its size at the shapes that its slopes ask for, as long as a step gains (Gauss-Newton).
+
+        Line by line a search goes zigzag where shapes depend on each other: a share of 15 % of the mass at 18.8 Hz came
+        out as 26 % at 18.5 Hz, with a third of a million squares left; five steps from there left none.
+        """
+        for _ in range(_MOST_STEPS):
+            changes = self._asked_of_slopes(term, free)
+            gain = -_WORST
+            for part in _STEP_PARTS:
+                there = {name: term.shape[name] + part * change for name, change in changes.items()}
+                bounds = CATALOGUE[term.name].bounds
+                tried = with_shape(term, {name: float(np.clip(at, *bounds[name])) for name, at in there.items()})
+                gain = self._gain(tried)
+                if gain > best:
+                    break
+            if not gain > best + _STEPPED_GAIN:
+                break
+            term, best = tried, gain
+        return term, best
+
+    def _asked_of_slopes(self, term: Term, free: Sequence[str]) -> dict[str, float]:
+        """Return by how much shapes are to change, all of them together."""
+        parts, spans = [self._evidence.columns_of(term)], {}
+        for name in free:
+            low, high = reach_of(self._evidence.recordings, term, name, _SLOPE_RATIO)
+            if high > low:
+                ends = (self._evidence.columns_of(with_shape(term, {name: at})) for at in (high, low))
+                parts.append(_difference(*ends))
+                spans[name] = high - low
+        try:
+            normal, right = self._reduced(_side_by_side(parts), replace(term, amplitudes=(term.name, *spans)))
+            steps = self._solved(normal[1:, 1:], right[1:] - normal[1:, 0])
+        except np.linalg.LinAlgError:  # two shapes that do the same
+            return {}
+        return {name: float(step) * span for step, (name, span) in zip(steps, spans.items(), strict=True)}
+
     @property
     def _is_beside_slopes(self) -> bool:
         """Tell whether beside it the size of something that moves readings or edges is known as a slope."""
@@ -222,6 +267,29 @@ class Refiner:
                 if rows is not None:
                     cross[[here[k] for k in present], mine] += rows @ part.T
         return normal - cross.T @ self._inverse @ cross, right - cross.T @ self._values
+
+
+def _difference(a: Columns, b: Columns) -> Columns:
+    """Return one term's columns minus another's."""
+
+    def of(one: np.ndarray | None, other: np.ndarray | None) -> np.ndarray | None:
+        if one is None or other is None:
+            return one if other is None else -other
+        return one - other
+
+    return [[of(*pair) for pair in zip(*pairs, strict=True)] for pairs in zip(a, b, strict=True)]
+
+
+def _side_by_side(columns: Sequence[Columns]) -> Columns:
+    """Return the columns of several terms as those of one."""
+
+    def of(parts: tuple[np.ndarray | None, ...]) -> np.ndarray | None:
+        there = next((part for part in parts if part is not None), None)
+        if there is None:
+            return None
+        return np.concatenate([np.zeros_like(there) if part is None else part for part in parts])
+
+    return [[of(parts) for parts in zip(*channels, strict=True)] for channels in zip(*columns, strict=True)]
 
 
 def gain_at_size(evidence: Evidence, refiner: Refiner, term: Term) -> float:
