@@ -129,6 +129,17 @@ def test_what_the_joint_was_settled_by_is_known(touching):
     assert np.max(there.penetration_m) == pytest.approx(np.max(touching.penetration_m) + 0.1e-6, rel=1e-3)
 
 
+def test_what_is_known_as_a_ratio_may_be_wrong_by_a_large_one(touching):
+    """A stiffness in N/m is no length: as one it could be off by 100e-6, and no wrong stiffness was ever named."""
+    reach = {term.name: term.bounds for term in hypotheses.wrong_parameter_terms(touching)}
+    damps = {"damping_n_s_per_m", "contact_damping on contact"}
+    assert reach.pop("backlash_width_m") == ((-100e-6, 100e-6),)
+    assert reach == {name: ((-1.0, 1.0),) if name in damps else ((-0.3, 0.3),) for name in reach}
+    sides = {f"{side}_stiffness_n_per_m" for side in ("left", "right", "contact")}
+    bodies = {f"{body}_{what}" for body in ("macro", "micro") for what in ("mass_kg", "force_constant")}
+    assert set(reach) == {*damps, *sides, *bodies, "spring_n_per_m"}
+
+
 def test_edges_that_wear_lie_further_out_at_every_instant(touching):
     """At 10 um/s and edge, the last swing of four seconds is 35 um less deep than the first, which has lost 1.25 um."""
     there = operating_point(touching, [(CATALOGUE["backlash_wear"], "contact_edge", {"rate_m_per_s": 20e-6})])

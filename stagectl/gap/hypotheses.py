@@ -53,7 +53,7 @@ def parameter_terms(recording: Recording) -> list[tuple[Term, float]]:
     joint = believed.joint
     found: list[tuple[Term, float]] = []
 
-    def known(name: str, sd: float, forces: Callable[[Recording], list[Forces]], unit: str = "error_ratio") -> None:
+    def known(name: str, sd: float, forces: Callable[[Recording], list[Forces]], unit: str = _RATIO) -> None:
         found.append((Term(name, "parameter", {}, (unit,), forces), sd))
 
     known("macro_mass_kg", believed.macro.mass_sd_kg / believed.macro.mass_kg, partial(_inertia, "macro"))
@@ -130,7 +130,10 @@ def _existing(name: str, place: str, values: list[float], r: Recording) -> list[
     return [effect_forces(r, CATALOGUE[name], place, values)]
 
 
+_RATIO = "error_ratio"
+
 _WRONG_RATIO = 0.3
+_WRONG_DAMPING_RATIO = 1.0
 _WRONG_M = 100e-6
 """How far a known parameter may be off that competes with the effects, beyond what is stated."""
 
@@ -138,7 +141,8 @@ _WRONG_M = 100e-6
 def wrong_parameter_terms(recording: Recording) -> Iterator[Term]:
     """Yield known parameters as hypotheses of their own: what is further off than its stated uncertainty allows.
 
-    Both stiffnesses of the contact alike, and both edges alike (a gap of another width), are one hypothesis each.
+    Both stiffnesses of the contact alike, and both edges alike (a gap of another width), are one hypothesis each. Times
+    and single edges are none: a command delay, a sensor delay, a shifted centre are effects.
     """
     terms = {term.name: term for term, _ in parameter_terms(recording)}
 
@@ -146,12 +150,16 @@ def wrong_parameter_terms(recording: Recording) -> Iterator[Term]:
         return Term(name, "parameter", {}, (terms_unit(name),), forces, "structural", ((-limit, limit),))
 
     for name, term in terms.items():
-        if not name.endswith(("_s", "_m")):
-            yield free(name, term.forces, _WRONG_RATIO if not name.startswith(("contact_", "viscous_")) else 1.0)
+        if term.amplitudes == (_RATIO,):
+            yield free(name, term.forces, _WRONG_DAMPING_RATIO if _damps(name) else _WRONG_RATIO)
     for name, parts in _BOTH_SIDES.items():
         if all(part in terms for part in parts):
             together = partial(_together, tuple(terms[part].forces for part in parts))
-            yield free(name, together, _WRONG_M if name.endswith("_m") else _WRONG_RATIO)
+            yield free(name, together, _WRONG_RATIO if terms_unit(name) == _RATIO else _WRONG_M)
+
+
+def _damps(parameter: str) -> bool:
+    return parameter.startswith(("damping_", "contact_damping", "viscous_"))
 
 
 def _together(parts: tuple[Callable[[Recording], list[Forces]], ...], r: Recording) -> list[Forces]:
@@ -176,7 +184,7 @@ def parts_of(parameter: str) -> tuple[str, ...]:
 
 def terms_unit(name: str) -> str:
     """Return what the amplitude of a wrong parameter is called: metres of an edge, else a ratio."""
-    return "error_m" if name.endswith("width_m") else "error_ratio"
+    return "error_m" if name.endswith("width_m") else _RATIO
 
 
 _TIMING_STEP_S = 5e-6
@@ -235,7 +243,9 @@ def _rate(r: Recording) -> np.ndarray:
 def effect_terms(recordings: Sequence[Recording], grids: dict[str, list[dict[str, float]]]) -> Iterator[Term]:
     """Yield every effect of the catalogue at every place and shape of its grid."""
     has_micro = all(r.end is not None for r in recordings)
-    present = {(row["name"], row["acts_on"]) for row in recordings[0].believed.effects}
+    believed = recordings[0].believed
+    present = {(row["name"], row["acts_on"]) for row in believed.effects}
+    sprung = believed.joint is not None and believed.joint.spring_n_per_m > 0.0
     for effect in CATALOGUE.values():
         if effect.period:
             continue  # searched by what stands out: `periodic_terms`
@@ -248,8 +258,8 @@ def effect_terms(recordings: Sequence[Recording], grids: dict[str, list[dict[str
                 continue
             if place.startswith("contact") and recordings[0].side is None:
                 continue
-            if (effect.name, place) in present:
-                continue
+            if (effect.name, place) in present or (effect.name == "linear_stiffness" and place == "joint" and sprung):
+                continue  # known: `wrong_parameter_terms` has it
             for shape in grids.get(effect.name, [{}]):
                 yield term_of(effect, place, shape)
 
