@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stagectl import adaptive_filter, compose, notch
+from stagectl import adaptive_filter, compose, fed_forward, notch
 from stagectl.compiled import compiled
 from stagectl.plant import PLANT_PARAMETERS, PLANT_STATE
 from stagectl.signals import Record
@@ -53,6 +53,7 @@ ESTIMATOR = np.dtype(
         ("macro_innovation_m", "f8"),
         ("end_innovation_m", "f8"),
         *adaptive_filter.FIELDS,  # of the axis that carries the end
+        *fed_forward.FIELDS,
         *notch.FIELDS,
     ]
 )
@@ -114,7 +115,12 @@ def init(profile: "Profile") -> np.ndarray:
             adaptive_filter.steady_gains(period_s, profile.macro.mass_kg, noise_m, control.macro_drift_n_per_sqrt_s)
         )
     jitter_s = profile.interferometer.jitter_s
-    adaptive_filter.init(e, period_s, precise.mass_kg, noise_m, drift, rest_ratio, precise.force_noise_n, jitter_s)
+    adaptive_filter.init(
+        *(e, period_s, precise.mass_kg, noise_m, drift, rest_ratio, precise.force_noise_n, jitter_s),
+        control.travel_drift_n_per_sqrt_m,
+    )
+    contact_doubt_ratio = 0.0 if profile.backlash is None else profile.backlash.force_sd_ratio
+    fed_forward.init(e, period_s, precise.mass_sd_kg, contact_doubt_ratio)
     return e
 
 
@@ -137,9 +143,20 @@ def start(e: Record, s: Record, m: Record) -> None:
     s.micro_disturbance_n = 0.0
     s.memory[:] = 0.0
     e.filter_mean_m = 0.0
+    fed_forward.forget(e)
     e.identification_waits = 0.0
     e.cycle = m.cycle
     e.started = 1.0
+
+
+@compiled
+def carry(e: Record, s: Record, q: Record, acceleration_m_per_s2: float) -> None:
+    """Carry the unknown force of the axis that carries the end on to where the reference accelerates like this."""
+    change_n = fed_forward.carry(e, acceleration_m_per_s2)
+    if q.has_micro != 0.0:
+        s.micro_disturbance_n += change_n
+    else:
+        s.macro_disturbance_n += change_n
 
 
 @compiled
@@ -154,15 +171,18 @@ def correct(e: Record, s: Record, q: Record, macro_position_m: float, end_positi
         innovation = end_position_m - s.end_position_m
         e.end_innovation_m = innovation
         innovation = notch.passed(e, innovation)
-        adaptive_filter.step(e, innovation, s.end_velocity_m_per_s)
+        doubted_n2 = fed_forward.doubted_n2(e, s.contact_force_n)
+        adaptive_filter.step(e, innovation, s.end_velocity_m_per_s, doubted_n2)
         s.end_position_m += e.precise_position_gain_ratio * innovation
         s.end_velocity_m_per_s += e.precise_velocity_gain_per_s * innovation
         s.micro_disturbance_n += e.precise_force_gain_n_per_m * innovation
+        fed_forward.learn(e, s.micro_disturbance_n, adaptive_filter.force_variance_n2(e))
     else:
         innovation = notch.passed(e, innovation)
-        adaptive_filter.step(e, innovation, s.macro_velocity_m_per_s)
+        adaptive_filter.step(e, innovation, s.macro_velocity_m_per_s, fed_forward.doubted_n2(e, 0.0))
         s.macro_position_m += e.precise_position_gain_ratio * innovation
         s.macro_velocity_m_per_s += e.precise_velocity_gain_per_s * innovation
         s.macro_disturbance_n += e.precise_force_gain_n_per_m * innovation
+        fed_forward.learn(e, s.macro_disturbance_n, adaptive_filter.force_variance_n2(e))
         s.end_position_m = s.macro_position_m
         s.end_velocity_m_per_s = s.macro_velocity_m_per_s

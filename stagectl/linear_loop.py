@@ -3,6 +3,8 @@
 No law, observer or plant is written a second time: the compiled tick and the compiled plant are run for one cycle
 from states that differ a little, and central differences are their matrices. Both are piecewise linear there (in the
 gap, or in contact on one side), so differences of any size give the same; y(e) of DSMC counts by its slope at e = 0.
+Where the reference accelerates the mass that is found on the way is a state more (`stagectl.fed_forward`), as doubted
+as the profile does.
 Inputs and outputs are named and in SI units. What the two ends of a broken loop give is `stagectl.margins`' matter.
 """
 
@@ -33,12 +35,14 @@ _BODY_STATES = (
 )
 _MODEL_STATES = (*_BODY_STATES, "macro_disturbance_n", "micro_disturbance_n")
 _ESTIMATOR_STATES = ("macro_word", "micro_word", "macro_word_before", "micro_word_before")
+_LEARNING_STATES = ("mass_error_kg",)  # where the reference accelerates; at rest nothing comes of it
 _PENETRATION_M = 1e-6  # deep enough that no small difference leaves the contact
 _FINE_RATIO = 1e-11  # of the step of a torque word: rounding vanishes
 _STEPS = (  # a difference by the unit that a name ends in; the first that fits
     ("_m_per_s2", 1e-3),
     ("_m_per_s", 1e-6),
     ("_m_s", 1e-12),
+    ("_kg", 1e-3),
     ("_n", 1e-3),
     ("_a", 1e-4),
     ("_m", 1e-9),
@@ -186,10 +190,12 @@ def linearise(
     place: int = GAP,
     adaptive_gain_ratio: float = 0.0,
     observer: Callable[[np.ndarray], None] = adaptive_filter.in_motion,
+    acceleration_m_per_s2: float = 0.0,
 ) -> Linearised:
     """Linearise a profile's controller about e = 0 with this adaptive gain, and a body at the same place.
 
-    `observer` brings it to where it is judged: as a force leaves it, or `adaptive_filter.at_rest`.
+    `observer` brings it to where it is judged: as a force leaves it, or `adaptive_filter.at_rest`. The reference is at
+    rest there, or in the midst of this acceleration.
 
     RequestError where the macro's drive closes its own loop, or an effect's dead time has no small differences.
     """
@@ -204,6 +210,11 @@ def linearise(
         one.estimator[f"{axis}_amperes_per_word"] *= _FINE_RATIO
     one.law["adaptive_gain_ratio"] = adaptive_gain_ratio
     observer(one.estimator)
+    one.setpoint[...] = np.zeros(1, SETPOINT)
+    delay_s = float(one.estimator["actuation_delay_s"][0] + one.estimator["lead_s"][0])
+    one.setpoint["acceleration_m_per_s2"] = acceleration_m_per_s2
+    one.setpoint["velocity_m_per_s"] = -acceleration_m_per_s2 * delay_s  # at rest when the command acts: e = 0
+    one.setpoint["position_m"] = 0.5 * acceleration_m_per_s2 * delay_s**2
     amperes_per_n = np.array([1.0 / float(one.belief[f"{axis}_force_constant_n_per_a"][0]) for axis in axes])
     amperes_per_word = np.array([float(one.estimator[f"{axis}_amperes_per_word"][0]) for axis in axes])
     tick, states = _tick_map(one, LAWS[law].LINEAR_STATES, axes, place, _memory_count(profile.effects))
@@ -299,7 +310,8 @@ def _tick_map(
     for name in ("started", "macro_started"):
         if name in (one.law.dtype.names or ()):
             one.law[name] = 1.0
-    one.setpoint[...] = np.zeros(1, SETPOINT)
+    for name in ("carried_acceleration_m_per_s2", "sampled_acceleration_m_per_s2"):
+        one.estimator[name] = one.setpoint["acceleration_m_per_s2"]
     if len(axes) == 2:
         # The reference is where the stage is: 7.5 mm beside it the macro's force is at its limit, and stays there.
         x_b = one.model["macro_position_m"] - one.model["end_position_m"]
@@ -308,9 +320,16 @@ def _tick_map(
     one.measurement["lease_left_ns"] = 1_000_000_000
     places = [(one.model, name) for name in _MODEL_STATES if _of_axes(name, axes)]
     places += [(one.estimator, name) for name in _ESTIMATOR_STATES if _of_axes(name, axes)]
+    if one.setpoint["acceleration_m_per_s2"][0] != 0.0:
+        places += [(one.estimator, name) for name in _LEARNING_STATES]
     places += [(one.estimator, name) for name in notch.LINEAR_STATES]
     places += [(one.law, name) for name in law_states if len(axes) == 2 or not name.startswith("macro_")]
     slots = _Slots(places, one.model["memory"][0, :memory_count])
+    before_contact = one.snapshot()
+    one.step()
+    contact_n = float(one.model["contact_force_n"][0])
+    one.restore(before_contact)
+    one.estimator["sampled_contact_n"] = contact_n  # a contact that stands still is no change of one
     rest = one.snapshot()
     measured = [f"{name}_position_m" for name in _seen(axes)]
     n = len(slots.names)

@@ -24,7 +24,7 @@ LAWS: dict[str, ModuleType] = {"dsmc": dsmc, "pid": pid}
 
 _TICK = '''
 @compiled
-def estimate(m, e, model, ahead, b, q, p):
+def estimate(m, now, later, e, model, ahead, b, q, p):
     """Bring the believed machine to this cycle's sample, and run a copy ahead to where a command acts."""
     s = model[0]
     x = e[0]
@@ -57,8 +57,11 @@ def estimate(m, e, model, ahead, b, q, p):
         if x.identification_waits != 0.0:  # for the sample above, or for one that stays away: its prediction then
             x.identification_waits = 0.0
             backlash.step(b[0], x.cycle, x.macro_seen_m, x.end_seen_m, x.waiting_force_n, q[0])
+        carried_from = x.carried_acceleration_m_per_s2
+        change = (now.acceleration_m_per_s2 - carried_from) / periods
         for k in range(periods):
             t_s = s.t_s
+            estimator.carry(x, s, q[0], carried_from + (k + 0.5) * change)
             plant_module.advance(model, q, p, t_s + x.actuation_delay_s, x.longest_substep_s,
                                  x.macro_word_before * x.macro_amperes_per_word,
                                  x.micro_word_before * x.micro_amperes_per_word, 1, 1)
@@ -66,6 +69,7 @@ def estimate(m, e, model, ahead, b, q, p):
                                  x.macro_word * x.macro_amperes_per_word,
                                  x.micro_word * x.micro_amperes_per_word, 1, 1)
             macro_error_m, end_error_m = plant_module.sense(model, q, p, x.period_s)
+            estimator.carry(x, s, q[0], carried_from + (k + 1.0) * change)
             if k == due - 1 or k == early - 1:
                 x.macro_seen_m = (m.macro_position_m if k == due - 1 else m.macro_earlier_m) - macro_error_m
                 x.end_seen_m = (m.end_position_m if k == due - 1 else m.end_earlier_m) - end_error_m
@@ -98,8 +102,13 @@ def estimate(m, e, model, ahead, b, q, p):
             x.micro_word_before = x.micro_word
         x.cycle = m.cycle
     ahead[0] = model[0]
+    carried_to = x.carried_acceleration_m_per_s2
+    estimator.carry(x, ahead[0], q[0], 0.5 * (carried_to + later.acceleration_m_per_s2))
     plant_module.advance(ahead, q, p, s.t_s + x.actuation_delay_s + x.lead_s, x.longest_substep_s,
                          x.macro_word * x.macro_amperes_per_word, x.micro_word * x.micro_amperes_per_word, 1, 1)
+    felt_s = reference.felt_after_s(reference.precise_current_loop_s(q[0]), x.period_s)
+    estimator.carry(x, ahead[0], q[0], later.acceleration_m_per_s2 + felt_s * later.jerk_m_per_s3)
+    x.carried_acceleration_m_per_s2 = carried_to
 
 
 @compiled
@@ -238,12 +247,12 @@ def tick(measurement, setpoint, later, command, e, model, ahead, after, l, g, b,
     now = setpoint[0]
     c = command[0]
     x = e[0]
-    estimate(m, e, model, ahead, b, q, p)
     snap_m_per_s4 = reference.snap_m_per_s4(
         now.jerk_m_per_s3, x.jerk_before_m_per_s3, x.jerk_change_before_m_per_s3, x.period_s)
     x.jerk_change_before_m_per_s3 = now.jerk_m_per_s3 - x.jerk_before_m_per_s3
     x.jerk_before_m_per_s3 = now.jerk_m_per_s3
     reference.extrapolate(later[0], now, x.actuation_delay_s + x.lead_s, snap_m_per_s4)
+    estimate(m, now, later[0], e, model, ahead, b, q, p)
     macro_n, micro_n = 0.0, 0.0
     if x.started != 0.0:  # before the first sample nothing is known: no force
         macro_n, micro_n = decide(m, now, later[0], e, ahead, after, l, q, p)

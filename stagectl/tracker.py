@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stagectl import backlash, estimator
+from stagectl import backlash, estimator, fed_forward
 from stagectl.laws.reference import gap_centre
 from stagectl.plant import PLANT_PARAMETERS
 from stagectl.signals import SETPOINT, new
@@ -102,6 +102,7 @@ class Tracker:
         one.guard["macro_position_m"] += macro_shift_m
         one.backlash[...] = backlash.init(self._profile)
         one.estimator["identification_waits"] = 0.0
+        fed_forward.forget(one.estimator[0])
 
     def new_belief(self) -> np.ndarray:
         """Return what the profile believes, for a request that changes nothing."""

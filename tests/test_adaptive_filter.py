@@ -42,7 +42,7 @@ def test_both_ends_are_kalman_filters_and_stay_where_they_are(state, ratio):
     state(record)
     np.testing.assert_allclose(gains(record), by_scipy(ratio * DRIFT, HELD_N), rtol=1e-4)
     for _ in range(50):
-        one.step(record[0], 0.0, 0.0)
+        one.step(record[0], 0.0, 0.0, 0.0)
     np.testing.assert_allclose(gains(record), by_scipy(ratio * DRIFT, HELD_N), rtol=1e-4)
 
 
@@ -50,7 +50,7 @@ def test_without_a_ratio_it_is_one_filter_whatever_it_is_shown():
     record = made(rest_drift_ratio=1.0)
     before = gains(record)
     for innovation_m in (0.0, 1e-6, -1e-3, 0.0):
-        one.step(record[0], innovation_m, 0.0)
+        one.step(record[0], innovation_m, 0.0, 0.0)
         np.testing.assert_allclose(gains(record), before, rtol=1e-9)
         assert record["unrest_ratio"] == 1.0
 
@@ -58,7 +58,7 @@ def test_without_a_ratio_it_is_one_filter_whatever_it_is_shown():
 def test_without_a_ratio_only_the_noise_of_its_speed_makes_it_softer():
     record = made(rest_drift_ratio=1.0, jitter_s=1e-6)
     for _ in range(2000):
-        one.step(record[0], 0.0, 0.2)
+        one.step(record[0], 0.0, 0.2, 0.0)
     np.testing.assert_allclose(gains(record), by_scipy(DRIFT, HELD_N, np.hypot(NOISE_M, 0.2e-6)), rtol=1e-3)
 
 
@@ -68,16 +68,16 @@ def test_a_force_stiffens_it_within_thirty_samples_and_noise_does_not():
     noise = np.random.default_rng(5).standard_normal(20000) * NOISE_M * 1.1
     unrest = []
     for innovation_m in noise:
-        one.step(record[0], innovation_m, 0.0)
+        one.step(record[0], innovation_m, 0.0, 0.0)
         unrest.append(float(record["unrest_ratio"][0]))
     assert np.mean(unrest) < 0.05
     for innovation_m in noise[:30] + 3.0 * NOISE_M:
-        one.step(record[0], innovation_m, 0.0)
+        one.step(record[0], innovation_m, 0.0, 0.0)
     assert record["unrest_ratio"] == 1.0
     np.testing.assert_allclose(gains(record), gains(stiff), rtol=0.02)
     one.at_rest(soft := made())
     for _ in range(300):
-        one.step(record[0], 0.0, 0.0)
+        one.step(record[0], 0.0, 0.0, 0.0)
     np.testing.assert_allclose(gains(record), gains(soft), rtol=0.02)
 
 
@@ -96,7 +96,7 @@ def test_what_strikes_at_rest_is_on_its_way_from_soft_to_stiff():
 
 def test_nan_is_no_rest():
     record = made()
-    one.step(record[0], float("nan"), 0.0)
+    one.step(record[0], float("nan"), 0.0, 0.0)
     assert record["unrest_ratio"] == 1.0
     assert np.all(np.isfinite(gains(record)))
 
@@ -109,15 +109,15 @@ def test_jitter_is_noise_at_a_speed_and_no_force(velocity_m_per_s):
     np.testing.assert_allclose(gains(record), by_scipy(0.12 * DRIFT, HELD_N), rtol=1e-4)  # none at standstill
     unrest = []
     for innovation_m in np.random.default_rng(6).standard_normal(5000) * noise_m * 1.1:
-        one.step(record[0], innovation_m, velocity_m_per_s)
+        one.step(record[0], innovation_m, velocity_m_per_s, 0.0)
         unrest.append(float(record["unrest_ratio"][0]))
     assert np.mean(unrest) < 0.05
     for _ in range(4000):
-        one.step(record[0], 0.0, velocity_m_per_s)
+        one.step(record[0], 0.0, velocity_m_per_s, 0.0)
     drift = 0.12 * DRIFT / np.sqrt(noise_m / NOISE_M)  # the louder, the softer
     np.testing.assert_allclose(gains(record), by_scipy(drift, HELD_N, noise_m), rtol=1e-3)
     one.at_speed(velocity_m_per_s)(settled := made(jitter_s=jitter_s))
-    one.step(settled[0], 0.0, 0.0)  # and stays so where nothing moves: a loop is linearised at rest
+    one.step(settled[0], 0.0, 0.0, 0.0)  # and stays so where nothing moves: a loop is linearised at rest
     np.testing.assert_allclose(gains(settled), by_scipy(drift, HELD_N, noise_m), rtol=1e-4)
 
 
@@ -127,7 +127,7 @@ def unrest(velocity_m_per_s: float, seed: int) -> np.ndarray:
     noise_m = np.hypot(NOISE_M, velocity_m_per_s * 1e-6) * 1.1
     found = []
     for innovation_m in np.random.default_rng(seed).standard_normal(50_000) * noise_m:
-        one.step(record[0], innovation_m, velocity_m_per_s)
+        one.step(record[0], innovation_m, velocity_m_per_s, 0.0)
         found.append(float(record["unrest_ratio"][0]))
     return np.array(found)
 
@@ -142,5 +142,18 @@ def test_noise_makes_no_more_unrest_at_a_speed_than_at_rest_and_longer_of_it():
 def test_a_force_stiffens_it_at_a_speed_too():
     record = made(jitter_s=1e-6)
     for _ in range(60):
-        one.step(record[0], 3.0 * 200e-9, 0.2)
+        one.step(record[0], 3.0 * 200e-9, 0.2, 0.0)
     assert record["unrest_ratio"] == 1.0
+
+
+def test_forces_that_hang_on_the_place_drift_with_the_way_and_never_beyond_the_stiffest():
+    record = np.zeros(1, RECORD)
+    one.init(record, PERIOD_S, MASS_KG, NOISE_M, DRIFT, 0.12, HELD_N, travel_drift_n_per_sqrt_m=0.02)
+    for velocity_m_per_s in (0.0, 0.2, -0.2, 100.0):
+        for _ in range(4000):
+            one.step(record[0], 0.0, velocity_m_per_s, 0.0)
+        drift = min(np.sqrt((0.12 * DRIFT) ** 2 + 0.02**2 * abs(velocity_m_per_s)), DRIFT)
+        np.testing.assert_allclose(gains(record), by_scipy(drift, HELD_N), rtol=1e-3)
+    one.at_speed(0.2)(record)
+    one.step(record[0], 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(gains(record), by_scipy(np.hypot(0.12 * DRIFT, 0.02 * np.sqrt(0.2)), HELD_N), rtol=1e-3)

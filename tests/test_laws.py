@@ -373,7 +373,10 @@ PAPER_TRAPEZOID = trajectory.trapezoid(0.8, 0.2, corners_s=(0.6, 0.3, 0.15), sta
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4, 5])
 def test_oled_printer_trapezoid(oled_profile, oled_machine, seed):
-    """0.8 m at 0.2 m/s and 1 m/s^2: 100 nm peak and 8 nm of hold are the bars; 2.9 nm is the bound of any law."""
+    """0.8 m at 0.2 m/s and 1 m/s^2: 100 nm peak and 8 nm of hold are the bars; 2.7 nm is the bound of any law.
+
+    (`lqg.bound` at 575 us from sample to force; a peak over 10 s is four to five deviations at least.)
+    """
     measured = {}
     for law in ("dsmc", "pid"):
         recording = followed(oled_profile, oled_machine, law, TRAPEZOID.setpoints, seed=seed)
@@ -383,11 +386,11 @@ def test_oled_printer_trapezoid(oled_profile, oled_machine, seed):
         error_m = true_error_m(recording)
         measured[law] = np.max(np.abs(error_m)), rms(error_m[-2000:])
     peak_m, hold_m = measured["dsmc"]
-    assert 25e-9 < peak_m < 100e-9
-    assert 2.9e-9 < hold_m < 8e-9
-    assert 2.9e-9 < measured["pid"][1] < 8e-9
-    # what prediction of force and delay is worth: two to ten times
-    assert 2.0 < measured["pid"][0] / peak_m < 10.0
+    assert 15e-9 < peak_m < 100e-9
+    assert 2.7e-9 < hold_m < 8e-9
+    assert 2.7e-9 < measured["pid"][1] < 8e-9
+    # what prediction of force and delay is worth, and a mass that is found on the way: two to fifteen times
+    assert 2.0 < measured["pid"][0] / peak_m < 15.0
 
 
 def test_oled_printer_sine(oled_profile, oled_machine):
@@ -446,7 +449,7 @@ def test_contact_is_survived(oled_profile, oled_machine):
     assert np.min(contact_n) < -0.5
     assert np.max(contact_n) > 0.5
     assert 60e-9 < np.max(np.abs(error_m)) < 500e-9
-    assert 2.9e-9 < rms(error_m[-2000:]) < 8e-9
+    assert 2.7e-9 < rms(error_m[-2000:]) < 8e-9
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
