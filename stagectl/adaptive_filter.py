@@ -12,7 +12,7 @@ l is how much louder than at standstill noise is at a speed (decision 0029), r t
 of innovations over l, sigma_r what noise makes of that mean. (A level of process noise that is adjusted: Bar-Shalom,
 Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 11.2.) g is the drift by the way, of
 forces that hang on where the end is (cables, cogging), s what the forces that are fed forward are doubted by for this
-period (`stagectl.fed_forward`): decision 0033. u is 0 at rest and 1 where a force moves the end: decision 0027. q^2
+period (`stagectl.fed_forward`): decision 0034. u is 0 at rest and 1 where a force moves the end: decision 0027. q^2
 never passes q_1^2. Inside, positions count in the sensor's noise, times in periods h, forces in m n / h^2. Pure.
 """
 
@@ -153,10 +153,9 @@ def step(e: Record, innovation_m: float, velocity_m_per_s: float, doubted_n2: fl
     share = (e.filter_mean_m / e.filter_force_mean_m) ** 2 * quieter
     unrest = share * share + doubted_n2 / (e.filter_force_n * e.filter_force_n * e.filter_walk)
     e.unrest_ratio = max(unrest if unrest < 1.0 else 1.0, e.least_unrest_ratio)  # nan: 1
-    rest_walk = e.filter_rest_walk + abs(velocity_m_per_s) * e.filter_travel_walk_s_per_m
-    rest_walk = min(
-        rest_walk / loudness, e.filter_walk
-    )  # adds the same share to the least error, n^(5/6) q^(1/6) to n^(3/4)
+    drift = e.filter_rest_walk + abs(velocity_m_per_s) * e.filter_travel_walk_s_per_m
+    # over l it adds the same share to the least error, n^(5/6) q^(1/6) to n^(3/4)
+    rest_walk = min(drift / loudness, e.filter_walk)
     walk = rest_walk + e.unrest_ratio * (e.filter_walk - rest_walk)
     held = e.filter_held
     p = e.filter_covariance

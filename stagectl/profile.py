@@ -326,9 +326,7 @@ class Control(Table):
     macro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 5.0
     micro_drift_n_per_sqrt_s: Annotated[float, above(0.0, 1e5)] = 0.2
     rest_drift_ratio: Annotated[float, within(1e-3, 1.0)] = 1.0  # of the drift, where the end's innovations are noise
-    travel_drift_n_per_sqrt_m: Annotated[float, within(0.0, 1e5)] = (
-        0.0  # of the end's unknown force, by the way it goes
-    )
+    travel_drift_n_per_sqrt_m: Annotated[float, within(0.0, 1e5)] = 0.0  # of the end's unknown force, by its way
     notch_frequency_hz: Annotated[float, within(0.0, 1e4)] = 0.0  # of the observer; 0 = none
     notch_damping_ratio: Annotated[float, within(0.01, 2.0)] = 0.3  # how wide
     notch_depth_ratio: Annotated[float, within(0.0, 1.0)] = 0.1  # what is left in the middle
