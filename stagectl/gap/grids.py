@@ -46,7 +46,7 @@ def grids_for(recordings: Sequence[Recording]) -> Grid:
         "position_dependent_friction": smooth[::2],
         "dahl_friction": [{"slip_m": s} for s in (1e-6, 5e-6, 2e-5, 1e-4)],
         "lugre_friction": [
-            {"static_ratio": 1.5, "stribeck_m_per_s": v, "slip_m": s} for v in (3e-3, 1e-2) for s in (2e-6, 1e-5)
+            {"static_ratio": 1.5, "stribeck_m_per_s": v, "slip_m": s} for v in (8e-4, 3e-3, 1e-2) for s in (2e-6, 1e-5)
         ],
         "cable_hysteresis": [
             {"slip_m": s, "exponent_ratio": p} for s in (2e-3, 6e-3, 2e-2, 6e-2) for p in (0.0, 0.999)
