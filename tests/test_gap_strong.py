@@ -247,16 +247,21 @@ def test_a_law_that_is_not_exact_is_as_uncertain_as_stretches_differ(uneven: flo
     assert least <= sd / solve([*search.judge.base, *chosen], search.evidence.sums).of(chosen[0])[1][0] < most
 
 
-def test_known_parameters_make_up_for_nothing_that_is_part_of_the_operating_point():
-    """Solved without a delay of 0.6 ms they did: half a newton of force noise, and four false names, beside it."""
-    delay_s = 0.6e-3
+def _late(delay_s: float) -> Callable[[float, float, float], float]:
+    """Return what makes a motor's force of commands that it has had that long."""
     waiting = deque([0.0] * round(delay_s / (H / STEPS)))
 
-    def late_n(command_n: float, x: float, v: float) -> float:
+    def made_n(command_n: float, x: float, v: float) -> float:
         waiting.append(command_n)
         return waiting.popleft()
 
-    recordings = [balance.recording_of(_axis_under(late_n, seed), AXIS) for seed in (1, 2)]
+    return made_n
+
+
+def test_known_parameters_make_up_for_nothing_that_is_part_of_the_operating_point():
+    """Solved without a delay of 0.6 ms they did: half a newton of force noise, and four false names, beside it."""
+    delay_s = 0.6e-3
+    recordings = [balance.recording_of(_axis_under(_late(delay_s), seed), AXIS) for seed in (1, 2)]
     term = hypotheses.term_at_size(CATALOGUE["command_delay"], "macro_command", {"delay_s": delay_s})
     search = Competition(recordings, 2, noise=slow_noise(AXIS, recordings[0]), kept=[term])
     motion = moved_under(search.kept, (), search, recordings, Serial())

@@ -28,6 +28,9 @@ _LEAST_SCALE = 0.5
 _KEPT_BYTES = 400e6
 """Columns of trials at their size are kept up to here, first come: a rank asks for the same ones beside others."""
 
+Scales = list[list[float]]
+"""By recording, by channel: its noise."""
+
 Columns = list[list[np.ndarray | None]]
 """By recording, by channel: (amplitudes, rows) of a term, None where it is zero."""
 
@@ -189,8 +192,13 @@ class Evidence:
             variance = max(square - 2.0 * float(theta @ right) + float(theta @ normal @ theta), 1e-300) / z.size
         return z - (theta / scale) @ rows
 
-    def finish(self, known_sds: np.ndarray, nulls_count: int, seed: int) -> None:
-        """Scale every channel by its noise, and sum.
+    @property
+    def scales(self) -> Scales:
+        """What every channel was scaled by."""
+        return [[channel.scale for channel in channels] for channels in self.channels]
+
+    def finish(self, known_sds: np.ndarray, nulls_count: int, seed: int, scales: Scales | None = None) -> None:
+        """Scale every channel by its noise, or by `scales` of other evidence that is compared with this, and sum.
 
         The noise is as large as it is at the highest frequencies, where no force reaches, once the known parameters
         (`known_sds`, the first columns) are free within what is stated. Taken from all that is left it would hide
@@ -199,26 +207,33 @@ class Evidence:
         """
 
         def summed(k: int) -> Sums:
-            return self._summed(k, known_sds, nulls_count, np.random.default_rng([seed, k]))
+            given = None if scales is None else scales[k]
+            return self._summed(k, known_sds, nulls_count, np.random.default_rng([seed, k]), given)
 
         self.sums += self.crew.here(summed, range(len(self.recordings)))
 
-    def _summed(self, k: int, known_sds: np.ndarray, nulls_count: int, random: np.random.Generator) -> Sums:
+    def _summed(
+        self, k: int, known_sds: np.ndarray, nulls_count: int, random: np.random.Generator, scales: list[float] | None
+    ) -> Sums:
         """Scale the channels of one recording and sum them."""
         size = self._count
         gram, nulls, count = np.zeros((size, size)), np.zeros((nulls_count, size - 1)), 0
         for c, channel in enumerate(self.channels[k]):
-            left = self.rest(k, c, known_sds)
-            power = np.abs(np.fft.rfft(left)) ** 2 / left.size
-            high = np.fft.rfftfreq(left.size) > _HIGH_SHARE
-            channel.scale = max(float(np.sqrt(np.mean(power[high]))), _LEAST_SCALE)
+            channel.scale = self._noise(k, c, known_sds) if scales is None else scales[c]
             rows = np.stack(channel.rows) / channel.scale
             channel.rows = list(rows)
             gram[np.ix_(channel.numbers, channel.numbers)] += rows @ rows.T
             at = np.array(channel.numbers[1:], dtype=int) - 1
-            nulls[:, at] += random.standard_normal((nulls_count, left.size)) @ rows[1:].T
-            count += left.size
+            nulls[:, at] += random.standard_normal((nulls_count, rows.shape[1])) @ rows[1:].T
+            count += rows.shape[1]
         return Sums(gram, float(count), *self.origins[k], nulls)
+
+    def _noise(self, recording: int, channel: int, known_sds: np.ndarray) -> float:
+        """Return how large innovations are at the highest frequencies beside known parameters."""
+        left = self.rest(recording, channel, known_sds)
+        power = np.abs(np.fft.rfft(left)) ** 2 / left.size
+        high = np.fft.rfftfreq(left.size) > _HIGH_SHARE
+        return max(float(np.sqrt(np.mean(power[high]))), _LEAST_SCALE)
 
     def append(self, term: Term, columns: Columns, prior_sds: tuple[float, ...], searched: int) -> Group:
         """Add the columns of a term to all products; returns them as a group."""

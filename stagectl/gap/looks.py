@@ -122,7 +122,7 @@ def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Loo
             same = moves_readings(search, other) and other.key[1] == group.key[1] and other.key[0] != group.key[0]
             if same and search.judge.gain([*rest, other]) > least:
                 forms.append(other)
-        left = [_left_under(search, [*rest, form], unsettled, crew) for form in forms] if len(forms) > 1 else [0.0]
+        left = _left_under(search, [[*rest, form] for form in forms], unsettled, crew) if len(forms) > 1 else [0.0]
         best = left.index(min(left))
         gone = {form.key for form, more in zip(forms, left, strict=True) if more > left[best] + ALIAS_GAIN}
         search.judge.trace.append(
@@ -143,12 +143,20 @@ def _named_as(look: Look, chosen: list[Group], k: int, gone: set[tuple[str, str]
     )
 
 
-def _left_under(search: Competition, chosen: list[Group], unsettled: Sequence[Recording], crew: Crew) -> float:
-    """Return what is left above the noise with all that moves the joint at its size."""
-    moving = [group for group in chosen if moves_readings(search, group) or changes_commands(search, group)]
-    moved = (*moved_now(search, chosen), *(moved_by(search, chosen, group) for group in moving))
-    beside = tuple(search.term(group) for group in chosen if group not in moving)
-    return left_at_size(unsettled, search.noise, moved, beside, crew)
+def _left_under(
+    search: Competition, models: Sequence[list[Group]], unsettled: Sequence[Recording], crew: Crew
+) -> list[float]:
+    """Return what models leave above the noise of the first, with all that moves the joint at its size."""
+    found: list[float] = []
+    scales = None
+    for chosen in models:
+        moving = [group for group in chosen if moves_readings(search, group) or changes_commands(search, group)]
+        moved = (*moved_now(search, chosen), *(moved_by(search, chosen, group) for group in moving))
+        beside = tuple(search.term(group) for group in chosen if group not in moving)
+        left, own = left_at_size(unsettled, search.noise, moved, beside, crew, scales)
+        scales = scales or own
+        found.append(left)
+    return found
 
 
 def _measured(look: Look) -> Look:
