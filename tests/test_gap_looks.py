@@ -36,7 +36,7 @@ def test_a_cyclic_error_has_its_size_along_readings_without_it(tmp_path):
 
 
 def test_a_delay_and_a_lag_that_leave_the_same_are_one_set(tmp_path):
-    """0.17 ms of one or of the other are 1.4 deviations apart. Each above a noise of its own, they seemed to be three."""
+    """0.17 ms of one or the other are 1.4 deviations apart; each above a noise of its own, they seemed to be three."""
     found, hidden = _found(2122, 6.0, tmp_path)
     late = {("sensor_delay", "macro_sensor"), ("sensor_lag", "macro_sensor")}
     assert {(found.name, found.acts_on), *(alias[:2] for alias in found.aliases)} == late

@@ -183,7 +183,11 @@ def _with_slopes(search: Competition, chosen: Sequence[Group], slopes: Sequence[
                 if column == slope.sizes.columns[0]:
                     at[column, scope] = at[slope.group.columns[0], scope]
                     ratios[column, scope] = slope.step / size
-    places = np.ix_(*2 * [[at[slot] for slot in plain.slots]])
-    weights = np.outer(*2 * [[ratios[slot] for slot in plain.slots]])
-    spread = tuple(one[places] * weights for one in scattered(search.evidence, joint, fixed))
-    return replace(plain, covariance=joint.covariance[places] * weights, scattered=spread)
+    places = [at[slot] for slot in plain.slots]
+    weights = np.array([ratios[slot] for slot in plain.slots])
+
+    def of_plain(covariance: np.ndarray) -> np.ndarray:
+        return covariance[np.ix_(places, places)] * np.outer(weights, weights)
+
+    spread = tuple(of_plain(one) for one in scattered(search.evidence, joint, fixed))
+    return replace(plain, covariance=of_plain(joint.covariance), scattered=spread)
