@@ -12,7 +12,8 @@ from stagectl.signals import SETPOINT
 from stagectl.tracker import Tracker
 
 PERIOD_S, MASS_SD_KG = 1e-3, 0.4
-RECORD = np.dtype([*adaptive_filter.FIELDS, *fed_forward.FIELDS])
+# Doubts first: numba warns where one record that it has compiled for is the beginning of another, as a bare filter's is.
+RECORD = np.dtype([*fed_forward.FIELDS, *adaptive_filter.FIELDS])
 
 
 def made(mass_sd_kg: float = MASS_SD_KG, contact_doubt_ratio: float = 0.1) -> np.ndarray:
