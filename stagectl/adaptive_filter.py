@@ -35,6 +35,7 @@ FIELDS = (
     ("filter_jitter_s_per_m", "f8"),  # rms of j over the sensor's noise
     ("filter_force_mean_m", "f8"),  # a mean of the innovations that is a force for sure: u = 1
     ("filter_covariance", "f8", (6,)),  # xx, xv, xd, vv, vd, dd behind the last sample
+    ("filter_innovation", "f8"),  # variance of the last innovation, as noise and drift make it
     ("filter_mean_m", "f8"),  # r
     ("least_unrest_ratio", "f8"),  # u falls no lower
     ("unrest_ratio", "f8"),  # u
@@ -170,6 +171,7 @@ def step(e: Record, innovation_m: float, velocity_m_per_s: float, doubted_n2: fl
     vv += held + walk / 3.0
     vd += walk / 2.0
     dd = p[5] + walk
+    e.filter_innovation = xx + noise
     to_position = xx / (xx + noise)
     to_velocity = xv / (xx + noise)
     to_force = xd / (xx + noise)
@@ -185,6 +187,7 @@ def step(e: Record, innovation_m: float, velocity_m_per_s: float, doubted_n2: fl
 
 
 @compiled
-def force_variance_n2(e: Record) -> float:
-    """Return the variance of the unknown force behind the last sample, N^2."""
-    return e.filter_covariance[5] * e.filter_force_n * e.filter_force_n
+def innovation_variance_m2(e: Record) -> float:
+    """Return the variance of the last innovation, as noise and drift make it, m^2."""
+    noise_m = e.filter_force_n / e.filter_n_per_m
+    return noise_m * noise_m * e.filter_innovation

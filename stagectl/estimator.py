@@ -171,18 +171,18 @@ def correct(e: Record, s: Record, q: Record, macro_position_m: float, end_positi
         innovation = end_position_m - s.end_position_m
         e.end_innovation_m = innovation
         innovation = notch.passed(e, innovation)
-        doubted_n2 = fed_forward.doubted_n2(e, s.contact_force_n)
+        doubted_n2 = fed_forward.foretell(e, s.contact_force_n)
         adaptive_filter.step(e, innovation, s.end_velocity_m_per_s, doubted_n2)
         s.end_position_m += e.precise_position_gain_ratio * innovation
         s.end_velocity_m_per_s += e.precise_velocity_gain_per_s * innovation
         s.micro_disturbance_n += e.precise_force_gain_n_per_m * innovation
-        fed_forward.learn(e, s.micro_disturbance_n, adaptive_filter.force_variance_n2(e))
+        fed_forward.learn(e, innovation, adaptive_filter.innovation_variance_m2(e))
     else:
         innovation = notch.passed(e, innovation)
-        adaptive_filter.step(e, innovation, s.macro_velocity_m_per_s, fed_forward.doubted_n2(e, 0.0))
+        adaptive_filter.step(e, innovation, s.macro_velocity_m_per_s, fed_forward.foretell(e, 0.0))
         s.macro_position_m += e.precise_position_gain_ratio * innovation
         s.macro_velocity_m_per_s += e.precise_velocity_gain_per_s * innovation
         s.macro_disturbance_n += e.precise_force_gain_n_per_m * innovation
-        fed_forward.learn(e, s.macro_disturbance_n, adaptive_filter.force_variance_n2(e))
+        fed_forward.learn(e, innovation, adaptive_filter.innovation_variance_m2(e))
         s.end_position_m = s.macro_position_m
         s.end_velocity_m_per_s = s.macro_velocity_m_per_s

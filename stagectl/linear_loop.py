@@ -3,8 +3,8 @@
 No law, observer or plant is written a second time: the compiled tick and the compiled plant are run for one cycle
 from states that differ a little, and central differences are their matrices. Both are piecewise linear there (in the
 gap, or in contact on one side), so differences of any size give the same; y(e) of DSMC counts by its slope at e = 0.
-Where the reference accelerates the mass that is found on the way is a state more (`stagectl.fed_forward`), as doubted
-as the profile does.
+Where the reference has jerk the mass that is found on the way is a state more, and what has been fed of it
+(`stagectl.fed_forward`).
 Inputs and outputs are named and in SI units. What the two ends of a broken loop give is `stagectl.margins`' matter.
 """
 
@@ -35,7 +35,7 @@ _BODY_STATES = (
 )
 _MODEL_STATES = (*_BODY_STATES, "macro_disturbance_n", "micro_disturbance_n")
 _ESTIMATOR_STATES = ("macro_word", "micro_word", "macro_word_before", "micro_word_before")
-_LEARNING_STATES = ("mass_error_kg",)  # where the reference accelerates; at rest nothing comes of it
+_FED_STATES = ("fed_m", "fed_m_per_s", "fed_n")  # of `mass_fed`; like the mass, only a jerk makes something of them
 _PENETRATION_M = 1e-6  # deep enough that no small difference leaves the contact
 _FINE_RATIO = 1e-11  # of the step of a torque word: rounding vanishes
 _STEPS = (  # a difference by the unit that a name ends in; the first that fits
@@ -190,12 +190,12 @@ def linearise(
     place: int = GAP,
     adaptive_gain_ratio: float = 0.0,
     observer: Callable[[np.ndarray], None] = adaptive_filter.in_motion,
-    acceleration_m_per_s2: float = 0.0,
+    jerk_m_per_s3: float = 0.0,
 ) -> Linearised:
     """Linearise a profile's controller about e = 0 with this adaptive gain, and a body at the same place.
 
     `observer` brings it to where it is judged: as a force leaves it, or `adaptive_filter.at_rest`. The reference is at
-    rest there, or in the midst of this acceleration.
+    rest when the command acts, or passes through it with this jerk, which lasts.
 
     RequestError where the macro's drive closes its own loop, or an effect's dead time has no small differences.
     """
@@ -212,9 +212,10 @@ def linearise(
     observer(one.estimator)
     one.setpoint[...] = np.zeros(1, SETPOINT)
     delay_s = float(one.estimator["actuation_delay_s"][0] + one.estimator["lead_s"][0])
-    one.setpoint["acceleration_m_per_s2"] = acceleration_m_per_s2
-    one.setpoint["velocity_m_per_s"] = -acceleration_m_per_s2 * delay_s  # at rest when the command acts: e = 0
-    one.setpoint["position_m"] = 0.5 * acceleration_m_per_s2 * delay_s**2
+    one.setpoint["jerk_m_per_s3"] = jerk_m_per_s3
+    one.setpoint["acceleration_m_per_s2"] = -jerk_m_per_s3 * delay_s  # at rest when the command acts: e = 0
+    one.setpoint["velocity_m_per_s"] = 0.5 * jerk_m_per_s3 * delay_s**2
+    one.setpoint["position_m"] = -jerk_m_per_s3 * delay_s**3 / 6.0
     amperes_per_n = np.array([1.0 / float(one.belief[f"{axis}_force_constant_n_per_a"][0]) for axis in axes])
     amperes_per_word = np.array([float(one.estimator[f"{axis}_amperes_per_word"][0]) for axis in axes])
     tick, states = _tick_map(one, LAWS[law].LINEAR_STATES, axes, place, _memory_count(profile.effects))
@@ -311,7 +312,8 @@ def _tick_map(
         if name in (one.law.dtype.names or ()):
             one.law[name] = 1.0
     for name in ("carried_acceleration_m_per_s2", "sampled_acceleration_m_per_s2"):
-        one.estimator[name] = one.setpoint["acceleration_m_per_s2"]
+        before_s = float(one.estimator["period_s"][0])
+        one.estimator[name] = one.setpoint["acceleration_m_per_s2"] - before_s * one.setpoint["jerk_m_per_s3"]
     if len(axes) == 2:
         # The reference is where the stage is: 7.5 mm beside it the macro's force is at its limit, and stays there.
         x_b = one.model["macro_position_m"] - one.model["end_position_m"]
@@ -320,8 +322,9 @@ def _tick_map(
     one.measurement["lease_left_ns"] = 1_000_000_000
     places = [(one.model, name) for name in _MODEL_STATES if _of_axes(name, axes)]
     places += [(one.estimator, name) for name in _ESTIMATOR_STATES if _of_axes(name, axes)]
-    if one.setpoint["acceleration_m_per_s2"][0] != 0.0:
-        places += [(one.estimator, name) for name in _LEARNING_STATES]
+    if one.setpoint["jerk_m_per_s3"][0] != 0.0:
+        fed = one.estimator["mass_fed"].view([(name, "f8") for name in _FED_STATES])[0]
+        places += [(one.estimator, "mass_error_kg"), *((fed, name) for name in _FED_STATES)]
     places += [(one.estimator, name) for name in notch.LINEAR_STATES]
     places += [(one.law, name) for name in law_states if len(axes) == 2 or not name.startswith("macro_")]
     slots = _Slots(places, one.model["memory"][0, :memory_count])
