@@ -2,8 +2,8 @@
 
 The stage is oled-printer with one whole cycle from sample to force. "Wrong" machines have masses, gap and contact
 stiffness off by 1 % and contact damping by 20 %, up or down; "calibrated" ones by 0.1 % and 5 %, as identification
-leaves them; in contact each of these five may err either way, and the worst of all 32 counts, since errors of masses and
-joint cancel in part. Machines keep their cogging, cable and force noise, which no profile knows. Bars are written here.
+leaves them; in contact each of these five may err either way, and the worst of all 32 counts, since errors of masses
+and joint cancel in part. Machines keep their cogging, cable and force noise, which no profile knows. Bars are written here.
 """
 
 import itertools
@@ -157,12 +157,14 @@ def corners(profile: Profile, kind: str) -> list[Machine]:
     joint, found = profile.backlash, []
     if joint is None:
         raise ValueError(f"{STAGE} has a joint")
+    kg = {"macro": profile.macro.mass_kg, "micro": _micro_kg(profile)}
     for macro, micro, width, stiffness, damping in itertools.product((1.0, -1.0), repeat=5):
         edges = {f"{side}_m": getattr(joint, f"{side}_m") * (1.0 + off * width) for side in ("left", "right")}
         one = machine(profile, 1.0, 1.0 + damping_off * damping, 1.0 + off * stiffness)
-        masses = {"macro": macro, "micro": micro}
-        kg = {name: {"mass_kg": profile.axis(name).mass_kg * (1.0 + off * sign)} for name, sign in masses.items()}
-        found.append(with_tables(one, **kg, backlash=edges))
+        masses = {
+            name: {"mass_kg": kg[name] * (1.0 + off * sign)} for name, sign in (("macro", macro), ("micro", micro))
+        }
+        found.append(with_tables(one, **masses, backlash=edges))
     return found
 
 
@@ -316,9 +318,7 @@ def _in_the_first_jerk() -> list[tuple[np.ndarray, float]]:
     rows = trapezoid()
     first = int(np.flatnonzero(rows["jerk_m_per_s3"])[0])
     jerk = rows["jerk_m_per_s3"][first:]
-    return [
-        (rows["acceleration_m_per_s2"][first : first + k], float(jerk[k])) for k in _JERK_SAMPLES if jerk[k] != 0.0
-    ]
+    return [(rows["acceleration_m_per_s2"][first : first + k], float(jerk[k])) for k in _JERK_SAMPLES if jerk[k] != 0.0]
 
 
 def _micro_kg(profile: Profile) -> float:

@@ -2,9 +2,10 @@
 
 The believed machine is the same plant code as the simulator's, composed with the profile's effects. Between
 two samples it feels the integers that were sent: the old command until the SYNC that latches the new one, then
-the new one. A sample corrects position, velocity and an unknown force on each axis (a random walk): with steady-state
-Kalman gains on a macro that carries a micro, by the adaptive filter on the axis that carries the end; a notch keeps a
-flexible mode out of that one where the profile has one. Prediction from the sample's instant to the instant the
+the new one. A sample corrects position, velocity and an unknown force on each axis: with steady-state Kalman gains on a
+macro that carries a micro (a random walk), by the adaptive filter on the axis that carries the end (one besides a mass
+that is found on the way: `stagectl.fed_forward`); a notch keeps a flexible mode out of that one where the profile has
+one. Prediction from the sample's instant to the instant the
 next command acts, lag and dead time of the profile's command effects included, is the same code run ahead. Pure;
 knows no bus and no clock.
 """

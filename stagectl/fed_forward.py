@@ -94,7 +94,7 @@ def carry(e: Record, acceleration_m_per_s2: float) -> float:
 
 @compiled
 def foretell(e: Record, contact_n: float) -> float:
-    """Bring what doubts make the observer miss to a sample; returns the variance of what changed since the last, N^2."""
+    """Bring what doubts make the observer miss to a sample; returns the variance of what changed before it, N^2."""
     acceleration = e.carried_acceleration_m_per_s2 - e.sampled_acceleration_m_per_s2
     contact = contact_n - e.sampled_contact_n
     e.sampled_acceleration_m_per_s2 = e.carried_acceleration_m_per_s2

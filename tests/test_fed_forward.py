@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bench import control_limit
+from bench.following import peak
 from stagectl import adaptive_filter, batch, fed_forward, margins, tick
 from stagectl.laws.reference import gap_centre
 from stagectl.linear_loop import GAP, RIGHT, linearise, machine_body
@@ -11,7 +12,7 @@ from stagectl.signals import SETPOINT
 from stagectl.tracker import Tracker
 
 PERIOD_S, MASS_KG, NOISE_M, MASS_SD_KG = 1e-3, 40.0, 5e-9, 0.4
-# Doubts first: numba warns where one record that it has compiled for is the beginning of another, as a bare filter's is.
+# Doubts first: numba warns where a record that it has compiled for begins another, as a bare filter would this one.
 RECORD = np.dtype([*fed_forward.FIELDS, *adaptive_filter.FIELDS])
 
 
@@ -54,7 +55,7 @@ def followed(
 ) -> np.ndarray:
     """Let a body of MASS_KG be observed that forces `unknown_n(t, x, v, a)` push besides; returns the innovations, m.
 
-    The reference is what the body does but for what is unknown, which a loop would make small: its x, v and a are asked.
+    The reference is what the body does but for what is unknown, which a loop would make small: x, v and a are its own.
     """
     noise = np.random.default_rng(seed).standard_normal(accelerations.size) * noise_m
     x = v = seen_x = seen_v = seen_d = 0.0  # of the body beside its reference, and what the observer makes of it
@@ -211,6 +212,14 @@ def test_a_wrong_mass_is_found_in_the_first_acceleration_of_a_trapezoid(ratio):
     found_kg, next_peak_m = accelerated(ratio)
     assert found_kg == pytest.approx(-40.0 * (ratio - 1.0), abs=0.04)
     assert next_peak_m < 20e-9  # 33 nm where nothing is found
+
+
+def test_a_force_that_stands_on_the_end_costs_nothing():
+    profile, rows = control_limit.stage(), control_limit.trapezoid()
+    one = control_limit.machine(profile)
+    pushed = control_limit.felt(one, {"name": "offset", "force_n": 0.3})
+    peaks = [peak(control_limit.run(profile, body, rows, 31).error_m) for body in (one, pushed)]
+    assert peaks[1] == pytest.approx(peaks[0], abs=3e-9)  # 71 nm where 0.3 N that stand are 0.3 kg
 
 
 def test_a_new_belief_is_believed(oled_profile):
