@@ -255,7 +255,7 @@ def _jitter(seeds: Sequence[int]) -> Iterator[Figure]:
             limit.peak_nm(limit.runs(one, "wrong", limit.trapezoid(), seeds, jitter_s=jitter_s))
             for one in (profile, limit.stage())
         )
-        said = f"nobody told: {ignorant_nm:.0f} nm; state jitter where the masses are calibrated"
+        said = f"nobody told: {ignorant_nm:.0f} nm"
         yield judged(Bar(JITTER_WRONG.format(us=us), "nm"), wrong_nm, used, said)
 
 

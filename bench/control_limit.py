@@ -3,7 +3,8 @@
 The stage is oled-printer with one whole cycle from sample to force. "Wrong" machines have masses, gap and contact
 stiffness off by 1 % and contact damping by 20 %, up or down; "calibrated" ones by 0.1 % and 5 %, as identification
 leaves them; in contact each of these five may err either way, and the worst of all 32 counts, since errors of masses
-and joint cancel in part. Machines keep their cogging, cable and force noise, which no profile knows. Bars are written here.
+and joint cancel in part. Machines keep their cogging, cable and force noise, which no profile knows. Bars are written
+here.
 """
 
 import itertools
