@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.control_limit import with_tables
 from bench.figure import Bar, Figure, absent, judged
 from bench.scans import controller_of, scan, true_error_m
 from sim_backend.machine import Machine, load_machine
-from stagectl import trajectory
+from stagectl import estimator, trajectory
 from stagectl.adaptive_filter import at_rest, in_motion
 from stagectl.batch import simulation
 from stagectl.effects import CATALOGUE
@@ -80,6 +81,15 @@ def _always_soft(controller: Controller, profile: Profile) -> None:
     controller.estimator["filter_walk"] = controller.estimator["filter_rest_walk"]
 
 
+def _believing(**tables: dict[str, float]) -> Callable[[Controller, Profile], None]:
+    """Return what gives the observer, and nothing else, the word of a profile with other values in its tables."""
+
+    def off(controller: Controller, profile: Profile) -> None:
+        controller.estimator[:] = estimator.init(with_tables(profile, **tables))
+
+    return off
+
+
 def _no_sliding(controller: Controller, profile: Profile) -> None:
     """Leave the surface alone to bring the error back: what was k s is no more."""
     controller.law["sliding_gain_per_s"] = 0.0
@@ -102,6 +112,9 @@ PARTS = (
     Part("no unknown force", _nothing, _no_unknown_force),
     Part("observer always as stiff as in motion", _always_stiff),
     Part("observer always as soft as at rest", _always_soft),
+    Part("no mass found on the way", _believing(micro={"mass_sd_kg": 0.0})),
+    Part("no doubt of the contact's force", _believing(backlash={"force_sd_ratio": 0.0})),
+    Part("no drift by the way", _believing(control={"travel_drift_n_per_sqrt_m": 0.0})),
     Part("no sliding part (k = 0)", _no_sliding),
     Part("no integral in the surface", _no_integral),
     Part("no adaptation", _no_adaptation),
