@@ -73,6 +73,17 @@ def test_the_command_writes_a_profile_whose_loops_keep_the_margins(capsys, tmp_p
     assert "is the profile itself, which is never changed" in err
 
 
+@pytest.mark.parametrize("name", ["tuned", "tuned.tml", "tuned.toml.bak"])
+def test_a_name_that_no_command_could_find_is_refused(capsys, tmp_path, slack, name):
+    code, _, err = call(capsys, "tune", slack, "--page", tmp_path, "-o", tmp_path / name)
+    assert code == 2
+    assert f"-o {tmp_path / name}: ends in " in err
+    assert "'.toml' only" in err
+    assert f"give {tmp_path / name}.toml" in err
+    assert not (tmp_path / name).exists()
+    assert not (tmp_path / "tune.html").exists()
+
+
 def test_a_bandwidth_is_met_and_one_that_has_no_margin_refused(oled_profile):
     slow = tuned(oled_profile, "dsmc", Asked(bandwidth_hz=50.0))
     assert slow.after.crossover_hz == pytest.approx(50.0, rel=0.03)
