@@ -81,6 +81,17 @@ def test_words_and_missing_numbers_stand_in_their_columns():
     assert "2.00 µm" in text
 
 
+def test_what_never_comes_is_infinite_in_the_table_and_null_in_json(capsys, tmp_path):
+    """(40) with sigma: its bound never doubles."""
+    code, out, _ = call(capsys, "reproduce", "sliding-mode", "--out", tmp_path, "--json")
+    assert code == 0
+    (section,) = json.loads(out)["sections"]
+    (row,) = [one for one in section["rows"] if "hours until" in one["quantity"]]
+    assert row["printed"] > 1.0
+    assert row["corrected"] is None
+    assert re.search(r"hours until .*\n?.*\u221e", (tmp_path / "paper.html").read_text())
+
+
 def test_progress_counts_chapters():
     heard = []
     (chapter,) = work_through(["quasi-linear"], lambda what, share: heard.append((what, share)))
