@@ -8,13 +8,16 @@ from rich.table import Table
 from rich.text import Text
 
 from stagectl.commands.answer import Answer, Voice
+from stagectl.commands.tables import Lines, WideOrLines
 from stagectl.errors import RequestError
 from stagectl.paper.chapters import BEYOND, asked, work_through
-from stagectl.paper.page import cells, page
+from stagectl.paper.page import COLUMNS, cells, page
 from stagectl.paper.rows import Chapter
 
 PAGE = "paper.html"
 
+_NUMBERS = COLUMNS[2:5]
+_LEAST_WIDTH = 72  # of a table: in less its labels have no room
 _LABEL_WIDTH = 12
 _NUMBER_WIDTH = 12  # words may be longer, and wrap
 
@@ -53,19 +56,21 @@ def _make_folder(out: Path) -> None:
         raise RequestError(f"--out {out}: can't be made: {error.strerror}; give another folder") from error
 
 
-def _table(chapter: Chapter) -> Table:
-    """Lay rows out with every number whole, 72 columns wide or wider; remarks stand under what they are of."""
+def _table(chapter: Chapter) -> WideOrLines:
+    """Lay rows out with every number whole; remarks stand under what they are of."""
     rows = [[str(cell) for cell in cells(row)] for row in chapter.rows]
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="bold cyan")
-    table.add_column("paper", max_width=_LABEL_WIDTH)
-    table.add_column("what", ratio=1)
-    for place, name in enumerate(("paper's", "as printed", "corrected"), start=2):
+    table.add_column("paper", max_width=_LABEL_WIDTH, overflow="fold")
+    table.add_column("what", ratio=1, overflow="fold")
+    for place, name in enumerate(_NUMBERS, start=2):
         longest = max((len(cells_of_row[place]) for cells_of_row in rows), default=0)
         width = min(max(longest, len(name)), _NUMBER_WIDTH)
-        table.add_column(name, justify="right", width=width)
+        table.add_column(name, justify="right", width=width, overflow="fold")
+    lines = []
     for equation, what, *numbers, remark in rows:
         text = Text(what)
         if remark:
             text.append(f"\n{remark}", style="dim")
         table.add_row(equation, text, *numbers)
-    return table
+        lines.append(Lines(f"{equation} {what}", list(zip(_NUMBERS, numbers, strict=True)), remark))
+    return WideOrLines(table, lines, _LEAST_WIDTH)
