@@ -10,14 +10,15 @@ import numpy as np
 
 from bench.control_limit import with_tables
 from bench.figure import Bar, Figure, absent, judged
-from bench.scans import controller_of, scan, true_error_m
 from sim_backend.machine import Machine, load_machine
 from stagectl import estimator, trajectory
 from stagectl.adaptive_filter import at_rest, in_motion
 from stagectl.batch import simulation
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
+from stagectl.followed import controller_of, scan, true_error_m
 from stagectl.laws.reference import gap_centre
+from stagectl.paper.rivals import compared
 from stagectl.profile import Profile, load_profile
 from stagectl.tick import Controller
 from tests.stage_loop import Loop
@@ -136,6 +137,7 @@ def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
     """Measure every part's absence."""
     profile, machine = load_profile("oled-printer"), load_machine("oled-printer")
     seeds = tuple(range(1, 21)) if full else _SEEDS
+    whole: dict[str, float] = {}
     for part in PARTS:
         say(f"ablation: {part.name}")
         found = measured(part, profile, machine, seeds)
@@ -144,7 +146,13 @@ def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
             bar = Bar(f"ablation, {part.name}: {what}", "nm")
             if np.isnan(value_m):
                 yield absent(bar, found.reason)
+            elif what in whole:
+                said = (
+                    f"the whole law has {1e9 * whole[what]:.3g} nm: {compared(value_m, whole[what])} without the part"
+                )
+                yield judged(bar, value_m * 1e9, list(seeds), said)
             else:
+                whole[what] = value_m
                 yield judged(bar, value_m * 1e9, list(seeds))
 
 

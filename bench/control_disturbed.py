@@ -31,7 +31,9 @@ MODES_HZ = (120.0, 160.0, 200.0, 275.0, 350.0)
 SHAKEN_HZ = (30.0, 100.0, 200.0, 300.0)
 JITTERS_S = (0.1e-6, 1e-6)
 
-MODE_SENSITIVITY = "control, mode at {hz:g} Hz: Ms, wherever within 3 %, however damped; gap, contacts, gains, observers"
+MODE_SENSITIVITY = (
+    "control, mode at {hz:g} Hz: Ms, wherever within 3 %, however damped; gap, contacts, gains, observers"
+)
 MODE_WORST = "control, mode at {hz:g} Hz: worst of the figures over its bar"
 SHAKEN = "control, base shakes with 6.25 um/s rms at {hz:g} Hz: worst of the figures over its bar"
 SHAKEN_HOLD = "control, base shakes with 6.25 um/s rms at {hz:g} Hz: hold over what the linear loop foretells"

@@ -5,7 +5,7 @@ import pytest
 
 from bench import ablation
 from bench.ablation import PARTS, measured
-from bench.scans import controller_of
+from stagectl.followed import controller_of
 
 SEED = (1,)
 SEEDS = (1, 2, 3, 4, 5)

@@ -59,7 +59,9 @@ def test_a_different_strength_reaches_the_plant():
 def test_every_reference_has_a_row_of_its_own(paths):
     """Twice the speed, twice the gap of a lag: the greater of the two would hide the other."""
     pair = paths["trapezoid"]
-    one = {(servo, r.name): twin.follow(r, servo, Strengths(record_lag_s=1e-4)) for servo in (SOFT, STIFF) for r in pair}
+    one = {
+        (servo, r.name): twin.follow(r, servo, Strengths(record_lag_s=1e-4)) for servo in (SOFT, STIFF) for r in pair
+    }
     other = {(servo, r.name): twin.follow(r, servo) for servo in (SOFT, STIFF) for r in pair}
     found = {r.name: peaks for r, peaks in comparison_chapter._peaks(pair, one, other)}
     assert set(found) == {"trapezoid I", "trapezoid II"}

@@ -88,7 +88,9 @@ def test_a_bandwidth_is_met_and_one_that_has_no_margin_refused(oled_profile):
     slow = tuned(oled_profile, "dsmc", Asked(bandwidth_hz=50.0))
     assert slow.after.crossover_hz == pytest.approx(50.0, rel=0.03)
     assert slow.after.worst_sensitivity < 2.0
-    with pytest.raises(RequestError, match=r"bandwidth of 120 Hz .* can't be kept: greatest sensitivity 3\.\d+ \(on the way\).*less"):
+    with pytest.raises(
+        RequestError, match=r"bandwidth of 120 Hz .* can't be kept: greatest sensitivity 3\.\d+ \(on the way\).*less"
+    ):
         tuned(oled_profile, "dsmc", Asked(bandwidth_hz=120.0))
 
 

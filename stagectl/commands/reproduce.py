@@ -4,6 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -13,8 +14,10 @@ from stagectl.errors import RequestError
 from stagectl.paper.chapters import BEYOND, asked, work_through
 from stagectl.paper.page import COLUMNS, cells, page
 from stagectl.paper.rows import Chapter
+from stagectl.profile import load_profile
 
 PAGE = "paper.html"
+_STAGE = "oled-printer"
 
 _NUMBERS = COLUMNS[2:5]
 _LEAST_WIDTH = 72  # of a table: in less its labels have no room
@@ -27,8 +30,9 @@ def show(voice: Voice, section: str | None, out: Path) -> Answer:
     names = asked(section)
     _make_folder(out)
     chapters = work_through(names, voice.progress)
+    rivals = _rivals(voice) if section is None else ()
     voice.progress("drawing the page", 0.0)
-    page(chapters, BEYOND if section is None else ()).write(out / PAGE)
+    page(chapters, (*BEYOND, *rivals) if section is None else ()).write(out / PAGE)
     voice.progress.done()
     data = {
         "sections": [
@@ -41,12 +45,24 @@ def show(voice: Voice, section: str | None, out: Path) -> Answer:
             }
             for chapter in chapters
         ],
+        "rivals": list(rivals),
         "page": str(out / PAGE),
     }
     shown = [
         part for chapter in chapters for part in (f"\n[bold]{chapter.section}. {chapter.title}[/]", _table(chapter))
     ]
-    return Answer(data, [*shown, f"page: {out / PAGE}"])
+    if rivals:
+        shown += ["\n[bold]Beyond the paper: linear rivals[/]", *map(escape, rivals)]
+    return Answer(data, [*shown, f"page: {escape(str(out / PAGE))}"])
+
+
+def _rivals(voice: Voice) -> tuple[str, ...]:
+    """Say where linear rivals are better than the law, on the stage that the project ships."""
+    from sim_backend.machine import load_machine
+    from stagectl.paper.rivals import said
+
+    voice.progress("beyond the paper: linear rivals", 0.0)
+    return said(load_profile(_STAGE), load_machine(_STAGE))
 
 
 def _make_folder(out: Path) -> None:

@@ -57,7 +57,7 @@ def chapter() -> Chapter:
     rows: list[Row] = []
     soft: dict[tuple[str, str], Followed] = {}
     contact: list[float] = []
-    for kind, pair in paths().items():
+    for pair in paths().values():
         believed = {(which, r.name): twin.follow(r, which) for which in (SOFT, STIFF) for r in pair}
         unlike = {(which, r.name): twin.follow(r, which, Strengths(reaction_ratio=0.0)) for which, r in _both(pair)}
         contact += [100.0 * float(np.mean(believed[which, r.name].contact_n != 0.0)) for which, r in _both(pair)]
