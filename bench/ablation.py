@@ -8,15 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.control_limit import with_tables
 from bench.figure import Bar, Figure, absent, judged
-from bench.scans import controller_of, scan, true_error_m
 from sim_backend.machine import Machine, load_machine
-from stagectl import trajectory
+from stagectl import estimator, trajectory
 from stagectl.adaptive_filter import at_rest, in_motion
 from stagectl.batch import simulation
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
+from stagectl.followed import controller_of, scan, true_error_m
 from stagectl.laws.reference import gap_centre
+from stagectl.paper.rivals import compared
 from stagectl.profile import Profile, load_profile
 from stagectl.tick import Controller
 from tests.stage_loop import Loop
@@ -80,6 +82,15 @@ def _always_soft(controller: Controller, profile: Profile) -> None:
     controller.estimator["filter_walk"] = controller.estimator["filter_rest_walk"]
 
 
+def _believing(**tables: dict[str, float]) -> Callable[[Controller, Profile], None]:
+    """Return what gives the observer, and nothing else, the word of a profile with other values in its tables."""
+
+    def off(controller: Controller, profile: Profile) -> None:
+        controller.estimator[:] = estimator.init(with_tables(profile, **tables))
+
+    return off
+
+
 def _no_sliding(controller: Controller, profile: Profile) -> None:
     """Leave the surface alone to bring the error back: what was k s is no more."""
     controller.law["sliding_gain_per_s"] = 0.0
@@ -102,6 +113,9 @@ PARTS = (
     Part("no unknown force", _nothing, _no_unknown_force),
     Part("observer always as stiff as in motion", _always_stiff),
     Part("observer always as soft as at rest", _always_soft),
+    Part("no mass found on the way", _believing(micro={"mass_sd_kg": 0.0})),
+    Part("no doubt of the contact's force", _believing(backlash={"force_sd_ratio": 0.0})),
+    Part("no drift by the way", _believing(control={"travel_drift_n_per_sqrt_m": 0.0})),
     Part("no sliding part (k = 0)", _no_sliding),
     Part("no integral in the surface", _no_integral),
     Part("no adaptation", _no_adaptation),
@@ -123,6 +137,7 @@ def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
     """Measure every part's absence."""
     profile, machine = load_profile("oled-printer"), load_machine("oled-printer")
     seeds = tuple(range(1, 21)) if full else _SEEDS
+    whole: dict[str, float] = {}
     for part in PARTS:
         say(f"ablation: {part.name}")
         found = measured(part, profile, machine, seeds)
@@ -131,7 +146,13 @@ def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
             bar = Bar(f"ablation, {part.name}: {what}", "nm")
             if np.isnan(value_m):
                 yield absent(bar, found.reason)
+            elif what in whole:
+                said = (
+                    f"the whole law has {1e9 * whole[what]:.3g} nm: {compared(value_m, whole[what])} without the part"
+                )
+                yield judged(bar, value_m * 1e9, list(seeds), said)
             else:
+                whole[what] = value_m
                 yield judged(bar, value_m * 1e9, list(seeds))
 
 

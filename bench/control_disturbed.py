@@ -5,6 +5,7 @@ applies a bound is computed beside it: of the linear loop for what shakes it, of
 motor coarser. The mode's own gain set is what `stagectl tune --mode-hz` makes of it.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -16,10 +17,10 @@ from bench import control_limit as limit
 from bench.figure import Bar, Figure, judged
 from bench.following import rms
 from sim_backend.machine import Machine
-from stagectl.adaptive_filter import at_rest, at_speed
+from stagectl.adaptive_filter import at_rest, at_speed, in_motion
 from stagectl.budget import lqg
 from stagectl.budget.lqg import Surroundings
-from stagectl.linear_loop import GAP, linearise, machine_body
+from stagectl.linear_loop import GAP, LEFT, ON_THE_WAY, RIGHT, Linearised, linearise, machine_body
 from stagectl.profile import Profile
 from stagectl.signals import SETPOINT
 from stagectl.tuning import mode as modes
@@ -30,7 +31,9 @@ MODES_HZ = (120.0, 160.0, 200.0, 275.0, 350.0)
 SHAKEN_HZ = (30.0, 100.0, 200.0, 300.0)
 JITTERS_S = (0.1e-6, 1e-6)
 
-MODE_SENSITIVITY = "control, mode at {hz:g} Hz: Ms, wherever within 3 % and however damped it is"
+MODE_SENSITIVITY = (
+    "control, mode at {hz:g} Hz: Ms, wherever within 3 %, however damped; gap, contacts, gains, observers"
+)
 MODE_WORST = "control, mode at {hz:g} Hz: worst of the figures over its bar"
 SHAKEN = "control, base shakes with 6.25 um/s rms at {hz:g} Hz: worst of the figures over its bar"
 SHAKEN_HOLD = "control, base shakes with 6.25 um/s rms at {hz:g} Hz: hold over what the linear loop foretells"
@@ -44,6 +47,13 @@ JITTER_AS_STIFF = "control, sample jitter {us:g} us rms: the same over the optim
 JITTER_UNTOLD = "control, sample jitter {us:g} us rms, and nobody told: over the bound"
 JITTER_PEAK = "control, sample jitter {us:g} us rms, contact-free, calibrated: peak"
 JITTER_WRONG = "control, sample jitter {us:g} us rms, contact-free, 1 % wrong: peak"
+
+PLACES = {GAP: "in the gap", LEFT: "in contact on the left", RIGHT: "in contact on the right"}
+OBSERVERS = {
+    "observer at rest": at_rest,
+    "observer in motion": in_motion,
+    **{f"observer on the way ({number})": one for number, one in enumerate(ON_THE_WAY, start=1)},
+}
 
 _SENSITIVITY = 2.5
 _TWICE = 2.0
@@ -136,12 +146,13 @@ def _with_mode(hz: float, seeds: Sequence[int]) -> Iterator[Figure]:
     found = gains_for(hz)
     profile = limit.stage(**found.values)
     mode = Mode(hz)
-    loop = linearise(profile, "dsmc", machine_body(limit.machine(profile)), GAP, _ceiling(profile))
-    sensitivity = modes.worst_sensitivity(loop, mode)
+    sensitivity, loop, where = worst_with_mode(profile, mode)
     notch = f"notch {profile.control.notch_damping_ratio:g} wide, {profile.control.notch_depth_ratio:g} deep"
     if profile.control.notch_frequency_hz == 0.0:
         notch = "no notch"
-    remark = f"{notch}, bandwidth {profile.control.micro_bandwidth_hz:.0f} Hz; residue -10 %, damping 1 %, and half"
+    remark = (
+        f"{where}; {notch}, bandwidth {profile.control.micro_bandwidth_hz:.0f} Hz; residue -10 %, damping 1 %, and half"
+    )
     yield judged(Bar(MODE_SENSITIVITY.format(hz=hz), "1", _SENSITIVITY), sensitivity, reason=remark)
     row = max(
         mode.corners(), key=lambda one: modes.sensitivity(replace(loop, body=modes.with_effect(loop.body, one)), mode)
@@ -153,8 +164,21 @@ def _with_mode(hz: float, seeds: Sequence[int]) -> Iterator[Figure]:
     yield judged(bar, value, list(seeds), said)
 
 
-def _ceiling(profile: Profile) -> float:
-    return profile.control.adaptive_gain_ceiling_ratio
+def worst_with_mode(profile: Profile, mode: Mode) -> tuple[float, Linearised, str]:
+    """Return the greatest Ms with a mode over places, adaptive gains and observers, the loop and its name in words.
+
+    All are judged at the hardest of what the mode may be, the worst of them at all of it.
+    """
+    body = machine_body(limit.machine(profile))
+    gains = {"floor": 0.0, "ceiling": profile.control.adaptive_gain_ceiling_ratio}
+    loops = {
+        f"worst {PLACES[place]}, gain at its {gain}, {observer}": linearise(
+            profile, "dsmc", body, place, gains[gain], OBSERVERS[observer]
+        )
+        for place, gain, observer in itertools.product(PLACES, gains, OBSERVERS)
+    }
+    where = max(loops, key=lambda one: modes.worst_sensitivity(loops[one], mode, modes.HARD_COUNT))
+    return modes.worst_sensitivity(loops[where], mode), loops[where], where
 
 
 # ---- a base that shakes --------------------------------------------------------------------------------------------

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from bench.figure import Bar, Figure, judged
-from bench.scans import controller_of, scan, true_error_m
 from sim_backend.machine import Machine, load_machine
 from stagectl import learning, trajectory
 from stagectl.errors import RequestError
+from stagectl.followed import controller_of, scan, true_error_m
 from stagectl.learning import Learning, Limits
 from stagectl.profile import Profile, load_profile
 

@@ -10,7 +10,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,11 +32,13 @@ from stagectl.paper.identification_test import Samples
 from stagectl.paper.observer_chapter import axes_of
 from stagectl.paper.printed_values import MACRO_OBSERVER_5_2, RIG_6_1, TABLE_2
 from stagectl.paper.recursive_least_squares import errors_percent
+from stagectl.paper.rivals import BETTER, compared
 from stagectl.paper.rows import Chapter
 
 ABOUT = (
     "As printed and corrected: `docs/paper.md` says where each equation stands. "
-    "Bars are written in `bench/paper.py` and `bench/control_limit.py`."
+    "Bars are written in `bench/paper.py` and `bench/control_limit.py`. Remarks say where a linear rival, or the law "
+    "without a part, is better."
 )
 
 TABLE_2_ERROR = Bar("identification, Table 2 test, 100 nm, exact masses: worst of four", "%", 0.001)
@@ -48,6 +51,7 @@ COVERED_LEAST = Bar(
 COVERED_MOST = Bar("the same, most of four", "%", 99.0)
 COST = Bar("identification, a step, compiled", "us", 2.0)
 PAPER_COST = Bar("the paper's observer and recursion, a step, compiled", "us")
+RIVAL_WINS = Bar("PID + feed-forward: rows in which it is better than DSMC", "rows")
 COLD = Bar("stagectl reproduce, nothing compiled: time", "s", 120.0)
 
 _SEEDS = range(1, 6)
@@ -56,6 +60,7 @@ _INTERVAL_SEEDS = range(1, 201)
 _NORMAL_95 = 1.96
 _NAMES = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
 _NOISE_M = 100e-9
+_RIVAL = "PID + feed-forward"
 
 Say = Callable[[str], None]
 
@@ -96,6 +101,34 @@ def figures_of(chapter: Chapter) -> Iterator[Figure]:
                 quantity = re.sub(r"\|(\w+)\|", r"abs(\1)", row.quantity)  # a bar would end the cell of a table
                 bar = Bar(f"{chapter.section} {row.equation} {quantity}: {which}", unit)
                 yield judged(bar, value * scale, reason=said)
+
+
+def _control(*, full: bool, say: Say) -> Iterator[Figure]:
+    """Control at the limit; to each of the rival's rows it is said what DSMC has there, and who is better."""
+    yield from beside_ours(control_limit.figures(full=full, say=say))
+
+
+def beside_ours(figures: Iterable[Figure]) -> Iterator[Figure]:
+    """Give rows through, those of a rival with DSMC's number of before and who is better; at last where it wins."""
+    ours: dict[str, Figure] = {}
+    wins: list[str] = []
+    count = 0
+    for figure in figures:
+        is_rival = figure.figure.startswith(_RIVAL)
+        what = figure.figure.removeprefix(f"{_RIVAL}: ").removeprefix("control, ")
+        what = re.sub(r" \([^)]*\)", "", what)  # what the macro is like stands there
+        our = ours.get(what)
+        if not is_rival:
+            ours[what] = figure
+        elif our is not None and our.value is not None and figure.value is not None:
+            how = compared(figure.value, our.value)
+            count += 1
+            wins += [what] * (how == BETTER)
+            said = f"DSMC has {our.value:.3g} {our.unit}: {_RIVAL} is {how}"
+            figure = replace(figure, reason="; ".join(filter(None, (figure.reason, said))))
+        yield figure
+    if count:
+        yield judged(RIVAL_WINS, len(wins), reason=f"of {count}: {', '.join(wins) or 'none'}")
 
 
 def _cold(*, full: bool, say: Say) -> Iterator[Figure]:
@@ -171,7 +204,7 @@ PARTS: dict[str, Callable[..., Iterator[Figure]]] = {
     "identification": _paper_tests,
     "identification-limit": identification_limit.figures,
     "identification-wire": identification_wire.figures,
-    "control": control_limit.figures,
+    "control": _control,
     "disturbed": control_disturbed.figures,
     "adaptive-drift": adaptive_drift.figures,
     "bounds": limits.figures,

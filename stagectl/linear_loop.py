@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 GAP, LEFT, RIGHT = 0, -1, 1
 """Where the joint is: in its gap, or touching on the left (x_b < -b_l) or on the right (x_b > b_r)."""
 
+ON_THE_WAY = tuple(adaptive_filter.stiffening(samples) for samples in (*range(1, 17), 20, 24))
+"""Observers from soft to stiff, 1, 2, 3 ... samples after a force has struck at rest: their loops count as well."""
+
 _AXES = ("macro", "micro")
 _BODY_STATES = (
     *("macro_position_m", "macro_velocity_m_per_s", "macro_acceleration_m_per_s2", "macro_current_a"),

@@ -5,9 +5,10 @@ import pytest
 
 from bench import ablation
 from bench.ablation import PARTS, measured
-from bench.scans import controller_of
+from stagectl.followed import controller_of
 
 SEED = (1,)
+SEEDS = (1, 2, 3, 4, 5)
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +31,31 @@ def test_an_observer_fed_with_what_was_asked_holds_worse(whole, oled_profile, ol
     assert found.hold_m > 1.15 * whole.hold_m
 
 
-@pytest.mark.parametrize(("name", "times"), [("no unknown force", 2.0), ("no sliding part", 2.0), ("no integral", 1.2)])
-def test_parts_of_the_law_earn_their_place_in_motion(whole, oled_profile, oled_machine, name, times):
-    assert measured(part(name), oled_profile, oled_machine, SEED).peak_m > times * whole.peak_m
+def test_without_the_unknown_force_the_end_strays_in_motion(whole, oled_profile, oled_machine):
+    assert measured(part("no unknown force"), oled_profile, oled_machine, SEED).peak_m > 2.0 * whole.peak_m
+
+
+@pytest.fixture(scope="module")
+def whole_by_seed(oled_profile, oled_machine):
+    return [measured(PARTS[0], oled_profile, oled_machine, (seed,)) for seed in SEEDS]
+
+
+@pytest.mark.parametrize(
+    ("name", "times"),
+    # Over seeds 1 to 12 single seeds have 2.0 to 1.5 without the mass, 1.32 to 1.01 without the integral, whose median
+    # is 1.15; beside an integral that is ten times too weak it is 1.04.
+    [("no sliding part", 2.0), ("no mass found", 1.4), ("no integral", 1.08)],
+)
+def test_parts_of_the_law_earn_their_place_in_motion(whole_by_seed, oled_profile, oled_machine, name, times):
+    without = [measured(part(name), oled_profile, oled_machine, (seed,)) for seed in SEEDS]
+    ratios = [one.peak_m / as_is.peak_m for one, as_is in zip(without, whole_by_seed, strict=True)]
+    assert np.median(ratios) > times
+
+
+def test_without_a_doubt_of_the_contact_only_the_contact_changes(whole, oled_profile, oled_machine):
+    found = measured(part("no doubt of the contact"), oled_profile, oled_machine, SEED)
+    assert (found.hold_m, found.peak_m) == (whole.hold_m, whole.peak_m)
+    assert found.contact_peak_m != whole.contact_peak_m
 
 
 def test_every_part_changes_a_state_of_its_own(oled_profile):

@@ -2,10 +2,12 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from bench.limits import over_as_stiff
 from stagectl import batch, trajectory
 from stagectl.budget import budget, measured, shares
 from stagectl.budget.disturbances import COGGING, CONTACT, DELAY, FORCE, MODEL, SENSOR, STEP, forces_missing, noises_of
@@ -22,6 +24,14 @@ from tests.stage import followed, simulated, true_error_m, with_values
 def held(oled_profile, oled_machine):
     """The budget of the stage that the project ships."""
     return budget.of_machine(oled_profile, "dsmc", oled_machine, seed=1)
+
+
+def test_without_a_loop_as_stiff_nothing_is_held_against_it(held):
+    assert over_as_stiff(held).holds
+    alone = over_as_stiff(replace(held, bounds=replace(held.bounds, as_stiff=None)))
+    assert alone.holds is False
+    assert alone.as_json()["value"] is None
+    assert "no loop with Ms 2.0" in alone.reason
 
 
 def test_the_sum_of_the_sources_is_what_was_measured(held):

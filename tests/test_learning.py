@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bench import learning as bench_learning
-from bench.scans import controller_of, scan, true_error_m
 from stagectl import learning, trajectory
 from stagectl.errors import RequestError
+from stagectl.followed import controller_of, scan, true_error_m
 from stagectl.learning import Limits
 from tests.stage import with_values
 

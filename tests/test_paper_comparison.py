@@ -54,3 +54,19 @@ def test_a_different_strength_reaches_the_plant():
     assert tables["coulomb_friction"]["level_n"] == 5.0
     assert tables["micro_reaction"]["fraction_ratio"] == 0.5
     assert {row["name"]: row for row in Strengths().effects()}["coulomb_friction"]["level_n"] == 0.0
+
+
+def test_every_reference_has_a_row_of_its_own(paths):
+    """Twice the speed, twice the gap of a lag: the greater of the two would hide the other."""
+    pair = paths["trapezoid"]
+    one = {
+        (servo, r.name): twin.follow(r, servo, Strengths(record_lag_s=1e-4)) for servo in (SOFT, STIFF) for r in pair
+    }
+    other = {(servo, r.name): twin.follow(r, servo) for servo in (SOFT, STIFF) for r in pair}
+    found = {r.name: peaks for r, peaks in comparison_chapter._peaks(pair, one, other)}
+    assert set(found) == {"trapezoid I", "trapezoid II"}
+    for k in (0, 1):
+        assert found["trapezoid II"][k] == pytest.approx(2.0 * found["trapezoid I"][k], rel=0.02)
+    row = comparison_chapter._row(pair[0], "x", None, found["trapezoid I"])
+    assert (row.equation, row.quantity) == ("Fig. 21, I", "trapezoid I: gap by x")
+    assert row.corrected == found["trapezoid I"][0]

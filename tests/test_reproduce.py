@@ -56,6 +56,19 @@ def test_every_number_is_whole_on_a_terminal_of_80_columns(capsys, tmp_path, mon
     assert max(len(line) for line in out.splitlines() if not line.startswith("page:")) <= 80
 
 
+@pytest.mark.parametrize("columns", [40, 60])
+def test_a_narrow_terminal_loses_neither_numbers_nor_labels(capsys, tmp_path, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    code, out, _ = call(capsys, "reproduce", "sliding-mode", "--out", tmp_path)
+    assert code == 0
+    assert "\u2026" not in out
+    assert max(len(line) for line in out.splitlines() if line[:4] not in ("page", "4.2.")) <= columns
+    words = " ".join(out.split())
+    said = "(32), (33) orbit on s' = 0 from 1 nm off, peak paper's \u2013 as printed 22.6 µm corrected 1.00 nm undamped"
+    assert said in words
+    assert "hours until k + (k / r) Omega has doubled paper's \u2013 as printed" in words
+
+
 def test_a_section_that_is_not_there_is_wrong_usage(capsys, tmp_path):
     code, _, err = call(capsys, "reproduce", "9.9", "--out", tmp_path / "new")
     assert code == 2
@@ -79,6 +92,17 @@ def test_words_and_missing_numbers_stand_in_their_columns():
     assert "diverges" in text
     assert str(Quantity(2e-6, "m")) == "2.00 µm"
     assert "2.00 µm" in text
+
+
+def test_what_never_comes_is_infinite_in_the_table_and_null_in_json(capsys, tmp_path):
+    """(40) with sigma: its bound never doubles."""
+    code, out, _ = call(capsys, "reproduce", "sliding-mode", "--out", tmp_path, "--json")
+    assert code == 0
+    (section,) = json.loads(out)["sections"]
+    (row,) = [one for one in section["rows"] if "hours until" in one["quantity"]]
+    assert row["printed"] > 1.0
+    assert row["corrected"] is None
+    assert re.search(r"hours until .*\n?.*\u221e", (tmp_path / "paper.html").read_text())
 
 
 def test_progress_counts_chapters():

@@ -7,13 +7,13 @@ import pytest
 
 from stagectl import trajectory
 from stagectl.errors import ProfileError, RequestError
-from stagectl.linear_loop import GAP, LEFT, RIGHT, believed_body, linearise
+from stagectl.linear_loop import GAP, LEFT, ON_THE_WAY, RIGHT, believed_body, linearise
 from stagectl.margins import margins
 from stagectl.profile import load_profile
 from stagectl.signals import Stop
 from stagectl.tuning.page import verdict
 from stagectl.tuning.patch import patched
-from stagectl.tuning.rules import MOVING, Asked, assessed, tuned
+from stagectl.tuning.rules import MOVING, STIFFENING, Asked, assessed, tuned
 from tests.command import call
 from tests.stage import followed, rms, true_error_m, with_values
 
@@ -45,6 +45,10 @@ def test_the_command_writes_a_profile_whose_loops_keep_the_margins(capsys, tmp_p
         assert one.is_stable
         assert one.sensitivity_peak_ratio <= 2.01
         assert one.delay_margin_s >= 0.8e-3
+    way = [margins(linearise(found, "dsmc", believed_body(found), GAP, 0.0, observer)) for observer in ON_THE_WAY]
+    worst = max(one.sensitivity_peak_ratio for one in way)
+    assert worst <= 2.01
+    assert answer["after"]["places"][STIFFENING]["sensitivity_peak_ratio"] == pytest.approx(worst, rel=1e-3)
     assert answer["after"]["worst_sensitivity_ratio"] > 1.9  # nothing is given away
     assert answer["after"]["stable_with_other_mass"]
     assert (tmp_path / "tune.html").read_text().count("<svg") == 2
@@ -69,11 +73,24 @@ def test_the_command_writes_a_profile_whose_loops_keep_the_margins(capsys, tmp_p
     assert "is the profile itself, which is never changed" in err
 
 
+@pytest.mark.parametrize("name", ["tuned", "tuned.tml", "tuned.toml.bak"])
+def test_a_name_that_no_command_could_find_is_refused(capsys, tmp_path, slack, name):
+    code, _, err = call(capsys, "tune", slack, "--page", tmp_path, "-o", tmp_path / name)
+    assert code == 2
+    assert f"-o {tmp_path / name}: ends in " in err
+    assert "'.toml' only" in err
+    assert f"give {tmp_path / name}.toml" in err
+    assert not (tmp_path / name).exists()
+    assert not (tmp_path / "tune.html").exists()
+
+
 def test_a_bandwidth_is_met_and_one_that_has_no_margin_refused(oled_profile):
     slow = tuned(oled_profile, "dsmc", Asked(bandwidth_hz=50.0))
     assert slow.after.crossover_hz == pytest.approx(50.0, rel=0.03)
     assert slow.after.worst_sensitivity < 2.0
-    with pytest.raises(RequestError, match=r"bandwidth of 120 Hz .* can't be kept: greatest sensitivity 2\.\d+ .*less"):
+    with pytest.raises(
+        RequestError, match=r"bandwidth of 120 Hz .* can't be kept: greatest sensitivity 3\.\d+ \(on the way\).*less"
+    ):
         tuned(oled_profile, "dsmc", Asked(bandwidth_hz=120.0))
 
 

@@ -10,11 +10,19 @@ from stagectl.whole_file import replace_whole
 
 
 def refuse_place(path: Path, out: Path, force: bool) -> None:
-    """Refuse to write over the old profile at all, and over another file without a word. Errors: RequestError."""
+    """Refuse what no command could name, the old profile itself, and another file without a word.
+
+    Errors: RequestError.
+    """
     if out.exists() and path.exists() and out.samefile(path):
         raise RequestError(f"-o {out} is the profile itself, which is never changed; give another file")
     if out.is_dir():
         raise RequestError(f"-o {out} is a folder; give the file to write")
+    if out.suffix != ".toml":
+        raise RequestError(
+            f"-o {out}: ends in '{out.suffix}', and commands find a profile by a name that ends in '.toml' only; "
+            f"give {out}.toml"
+        )
     if not out.parent.is_dir():
         raise RequestError(f"-o {out}: there is no folder {out.parent}; make it, or give another file")
     if out.exists() and not force:

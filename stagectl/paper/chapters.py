@@ -25,7 +25,7 @@ BEYOND = (
     "bar. Figures of one commit are in docs/figures-paper.md.",
     "What an error of a stage of one's own is made of, and how far it is from the bound: `stagectl budget PROFILE`.",
 )
-"""What the paper has no equation, table, figure or claim of, and where it is measured."""
+"""What the paper has no equation, table, figure or claim of, and where it is measured; `rivals` says where they win."""
 
 
 def asked(section: str | None) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from stagectl.report import Figure, Quantity
 SOFT = Servo(macro_hz=2.0, micro_hz=10.0, macro_feed_forward_ratio=0.0)
 STIFF = Servo(macro_hz=12.0, micro_hz=20.0, macro_feed_forward_ratio=1.0)
 
-_PAPER_M = {"sine": 7.5e-6, "trapezoid": 10.2e-6}
+_PAPER_M = {"sine": 7.5e-6, "trapezoid": 10.2e-6}  # the largest of I and II
 _SINE_SETTLED_S = 5.0
 _CORNERS_S = (0.2, 0.1, 0.05)
 
@@ -57,15 +57,15 @@ def chapter() -> Chapter:
     rows: list[Row] = []
     soft: dict[tuple[str, str], Followed] = {}
     contact: list[float] = []
-    for kind, pair in paths().items():
+    for pair in paths().values():
         believed = {(which, r.name): twin.follow(r, which) for which in (SOFT, STIFF) for r in pair}
         unlike = {(which, r.name): twin.follow(r, which, Strengths(reaction_ratio=0.0)) for which, r in _both(pair)}
         contact += [100.0 * float(np.mean(believed[which, r.name].contact_n != 0.0)) for which, r in _both(pair)]
         for what, strengths in HIDDEN.items():
             rig = {(which, r.name): twin.follow(r, which, strengths) for which, r in _both(pair)}
-            rows.append(_row(kind, what, None, _peaks(pair, rig, believed)))
+            rows += [_row(r, what, None, peaks) for r, peaks in _peaks(pair, rig, believed)]
             soft |= {(what, r.name): rig[SOFT, r.name] for r in pair}
-        rows.append(_row(kind, _REACTION, _peaks(pair, believed, unlike), None))
+        rows += [_row(r, _REACTION, peaks, None) for r, peaks in _peaks(pair, believed, unlike)]
         soft |= {("believed", r.name): believed[SOFT, r.name] for r in pair}
         soft |= {(_REACTION, r.name): unlike[SOFT, r.name] for r in pair}
     soft_contact, stiff_contact = max(contact[0::2]), max(contact[1::2])
@@ -80,9 +80,8 @@ def chapter() -> Chapter:
             "than the "
             "believed one. Both follow the same reference under the same PID; a gap is the largest difference of what "
             "is seen of both ends.",
-            "Sine I 0.1 m at 0.75 rad/s, II 0.05 m at 1.5 rad/s; trapezoid I 0.05 m/s, II 0.1 m/s. The greater "
-            "gap of I "
-            "and II counts. The joint is that of section 6.1.",
+            "Sine I 0.1 m at 0.75 rad/s, II 0.05 m at 1.5 rad/s; trapezoid I 0.05 m/s, II 0.1 m/s. The "
+            "paper's number is the largest of I and II; whose it is it doesn't say. The joint is that of section 6.1.",
             "The numbers are those of soft servos (macro 2 Hz, micro 10 Hz, no feed-forward), in contact up to "
             f"{soft_contact:.0f} % of the time; remarks have stiff ones (12 and 20 Hz, feed-forward, "
             f"{stiff_contact:.0f} "
@@ -102,20 +101,23 @@ def _peaks(
     pair: tuple[Reference, Reference],
     one: dict[tuple[Servo, str], Followed],
     other: dict[tuple[Servo, str], Followed],
-) -> tuple[float, float]:
-    """Return the greater gap of both references, with soft and with stiff servos, m."""
-    soft, stiff = (
-        max(float(np.max(np.abs(gap_m(one[which, r.name], other[which, r.name])))) for r in pair)
-        for which in (SOFT, STIFF)
-    )
-    return soft, stiff
+) -> list[tuple[Reference, tuple[float, float]]]:
+    """Return each reference with its largest gaps, with soft and with stiff servos, m."""
+
+    def peak_m(which: Servo, r: Reference) -> float:
+        return float(np.max(np.abs(gap_m(one[which, r.name], other[which, r.name]))))
+
+    return [(r, (peak_m(SOFT, r), peak_m(STIFF, r))) for r in pair]
 
 
-def _row(kind: str, what: str, printed: tuple[float, float] | None, corrected: tuple[float, float] | None) -> Row:
+def _row(
+    reference: Reference, what: str, printed: tuple[float, float] | None, corrected: tuple[float, float] | None
+) -> Row:
     peaks = printed or corrected or (np.nan, np.nan)
+    kind, _, which = reference.name.partition(" ")
     return Row(
-        f"Fig. {20 if kind == 'sine' else 21}",
-        f"{kind}: gap by {what}",
+        f"Fig. {20 if kind == 'sine' else 21}, {which}",
+        f"{reference.name}: gap by {what}",
         "m",
         _PAPER_M[kind],
         printed[0] if printed else None,

@@ -1,5 +1,6 @@
 """The page of the comparison: chapter for chapter the paper's numbers beside ours, the readings, the figures."""
 
+import math
 from collections.abc import Sequence
 
 from stagectl.paper.rows import Chapter, Row, Value
@@ -34,5 +35,7 @@ def cells(row: Row) -> list[str | Quantity]:
 
 
 def shown(value: Value, unit: str) -> str | Quantity:
-    """Give a number its unit; words stay words."""
+    """Give a number its unit; words stay words, and what has no end is one."""
+    if value == math.inf:
+        return "\u221e"
     return value if isinstance(value, str) else Quantity(value, unit)

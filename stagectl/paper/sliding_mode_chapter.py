@@ -1,5 +1,6 @@
 """Section 4.2, Theorem 1: the adaptive integral sliding mode (27)-(45), and what it proves."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -178,9 +179,9 @@ def _climb_rows() -> list[Row]:
         pair("(40)", f"{held}: Omega climbs by, per hour", "N", None, (printed.rate_n_per_h, corrected.rate_n_per_h),
             f"{_CLIMB_S / 60.0:g} min simulated; 95 %: +- {1e6 * printed.half_width_n_per_h:.2g} uN and +- "
             f"{1e6 * corrected.half_width_n_per_h:.2g} uN. With sigma it rests {1e6 * above_n:.2g} uN above Omega_0"),
-        Row("(40)", f"{held}: hours until k + (k / r) Omega has doubled", "1", None, printed.doubled_h, "never",
-            "the climb goes with the square of the noise, and hardly with Omega"),
-        Row("(40)", f"the same, {1e9 * _NOISY_M:g} nm", "1", None, noisy.doubled_h, "never"),
+        Row("(40)", f"{held}: hours until k + (k / r) Omega has doubled", "1", None, printed.doubled_h, math.inf,
+            "the climb goes with the square of the noise, and hardly with Omega; corrected: never"),
+        Row("(40)", f"the same, {1e9 * _NOISY_M:g} nm", "1", None, noisy.doubled_h, math.inf),
         Row("(40)", f"{held}, the printed surface as well: Omega climbs by, per hour", "N", None, whole.rate_n_per_h,
             None, "L_w, which (29) leaves out, and y(e) make a limit cycle that feeds it"),
     ]  # fmt: skip

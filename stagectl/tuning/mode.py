@@ -18,7 +18,7 @@ from stagectl.linear_loop import Body, Linearised
 
 _WIDTHS = (0.1, 0.2, 0.3, 0.5)  # damping ratios of a notch's denominator that are tried
 _DEPTHS = (0.05, 0.1, 0.2)
-_HARD_COUNT = 3  # corners that a search looks at
+HARD_COUNT = 3  # corners that a search looks at: the least damped, with the whole residue
 _SLOWER, _SLOWEST = 0.92, 0.2  # steps of the bandwidth, and its end
 _LOW_HZ = 3.0
 _GRID_COUNT = 160
@@ -112,7 +112,7 @@ def searched(
     """
     value, best = bandwidth_hz, notches(mode)[0]
     while True:
-        found = [(worst_sensitivity(made(value, notch), mode, _HARD_COUNT), k) for k, notch in enumerate(notches(mode))]
+        found = [(worst_sensitivity(made(value, notch), mode, HARD_COUNT), k) for k, notch in enumerate(notches(mode))]
         least, k = min(found)
         best = notches(mode)[k]
         if least <= max_sensitivity and worst_sensitivity(made(value, best), mode) <= max_sensitivity:

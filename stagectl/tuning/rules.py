@@ -8,12 +8,13 @@ one number, w: it is made as large as the margins allow, the adaptive gain at it
 that is asked for takes. PID has its bandwidth as that one number. A flexible mode that is known gets a notch
 (`stagectl.tuning.mode`), and the bandwidth that the notch leaves.
 
-Every result is checked in the gap and in contact on either side, in motion where there is dry friction, and with the
-moved mass 10 % off.
+Every result is checked in the gap and in contact on either side, in motion where there is dry friction, on the
+observer's way from soft at rest to stiff, where the margins are less than at either end, and with the moved mass 10 %
+off.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -27,7 +28,7 @@ from stagectl.budget.budget import STEP_N
 from stagectl.budget.disturbances import noises_of
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RequestError
-from stagectl.linear_loop import GAP, LEFT, RIGHT, Body, Linearised, believed_body, linearise
+from stagectl.linear_loop import GAP, LEFT, ON_THE_WAY, RIGHT, Body, Linearised, believed_body, linearise
 from stagectl.margins import Margins, grid_hz, margins
 from stagectl.tuning import mode as modes
 from stagectl.tuning.mode import Mode
@@ -42,6 +43,8 @@ MOVING = "in motion"
 """In the gap, at a speed at which dry friction is a force that damps nothing."""
 RESTING = "gap, at rest"
 """With the observer as soft as it is there."""
+STIFFENING = "on the way"
+"""With the observer on its way from soft to stiff, wherever that is worst."""
 MASS_RATIO = 0.1
 
 _SLIDING_RATIO, _ETA_RATIO = (
@@ -56,6 +59,7 @@ _GRID_COUNT = 13
 _BISECTIONS = 7
 _USUAL_SENSITIVITY = 2.0
 _SLACK = 1.002  # of a limit that a search ends at
+_COARSE = 5  # every fifth frequency tells which loop is the worst
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +199,9 @@ def assessed(profile: "Profile", law: str, mode: Mode | None = None) -> Assessme
     if profile.control.rest_drift_ratio < 1.0:
         one = linearise(profile, law, body, GAP, most, observer=at_rest)
         loops.append(Loop(RESTING, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
+    if _stiffens(profile, law):
+        one = _worst_on_the_way(profile, law, body, PLACES if profile.micro is not None else (GAP,))
+        loops.append(Loop(STIFFENING, margins(one), frequency_hz, one.loop_gain(frequency_hz)))
     if mode is not None:
         loops += _loops_with(linearise(profile, law, body, GAP, most), mode)
     in_gap = linearise(profile, law, body)
@@ -219,6 +226,28 @@ def _in_motion(profile: "Profile") -> "Profile | None":
     """
     rows = tuple(row for row in profile.effects if CATALOGUE[row["name"]].shown_by != "low speed")
     return None if len(rows) == len(profile.effects) else profile.model_copy(update={"effects": rows})
+
+
+def _stiffens(profile: "Profile", law: str) -> bool:
+    """Tell whether a law has an observer that is softer at rest."""
+    return law == "dsmc" and profile.control.rest_drift_ratio < 1.0
+
+
+def _worst_on_the_way(profile: "Profile", law: str, body: Body, places: Iterable[int]) -> Linearised:
+    """Return the loop of the greatest sensitivity of those that a stiffening observer passes; an unstable one first."""
+    frequency_hz = grid_hz(profile.cycle.period_s)[::_COARSE]
+
+    def sensitivity(one: Linearised) -> float:
+        return float(np.max(1.0 / np.abs(1.0 + one.loop_gain(frequency_hz)))) if one.closed().is_stable() else math.inf
+
+    gains = sorted({0.0, most_adaptive_gain_ratio(profile, law)})
+    passed = (
+        linearise(profile, law, body, place, gain, observer)
+        for place in places
+        for gain in gains
+        for observer in ON_THE_WAY
+    )
+    return max(passed, key=sensitivity)
 
 
 def _loops_with(one: Linearised, mode: Mode) -> list[Loop]:
@@ -307,11 +336,16 @@ def _searched(profile: "Profile", law: str, key: str, asked: Asked) -> float:
         one = found(value)
         if asked.bandwidth_hz is not None:
             return one.is_stable and one.crossover_hz <= asked.bandwidth_hz
-        return all(one.is_stable and _within(one, asked) for one in map(partial(found, value), range(len(looked_at))))
+        if not all(one.is_stable and _within(one, asked) for one in map(partial(found, value), range(len(looked_at)))):
+            return False
+        if not _stiffens(profile, law):
+            return True
+        one = margins(_worst_on_the_way(_with(profile, law, value), law, looked_at[-1][1], (GAP,)))
+        return one.is_stable and _within(one, asked)
 
     values = np.geomspace(_SPAN[0], _SPAN[1], _GRID_COUNT) * now
-    kept = [k for k, value in enumerate(values) if keeps(float(value))]
-    if not kept:
+    kept = next((k for k in reversed(range(_GRID_COUNT)) if keeps(float(values[k]))), None)
+    if kept is None:
         least = found(float(values[_GRID_COUNT // 2]))
         if not any(found(float(value)).is_stable for value in values):
             raise RequestError(
@@ -326,10 +360,10 @@ def _searched(profile: "Profile", law: str, key: str, asked: Asked) -> float:
             f"{least.delay_margin_s * 1e3:.2f} ms, the crossover {least.crossover_hz:.0f} Hz; {remedy}, or "
             "shorten cycle.actuation_delay_s"
         )
-    low = float(values[kept[-1]])
-    if kept[-1] == _GRID_COUNT - 1:
+    low = float(values[kept])
+    if kept == _GRID_COUNT - 1:
         return low
-    high = float(values[kept[-1] + 1])
+    high = float(values[kept + 1])
     for _ in range(_BISECTIONS):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if keeps(middle) else (low, middle)

@@ -1,37 +1,44 @@
-"""One machine behind the value seam along one reference: what scans, ablation and learning are measured on."""
+"""What a controller makes of a machine along a reference, behind the value seam, from rest.
+
+A machine is anything with a machine file's attributes.
+"""
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim_backend.machine import Machine
 from stagectl import batch, tick
-from stagectl.batch import Recording
+from stagectl.batch import Recording, Simulation
 from stagectl.errors import RequestError
 from stagectl.laws.reference import gap_centre
-from stagectl.profile import Profile
 from stagectl.signals import SETPOINT, STOP_TEXT, Stop
 from stagectl.tick import Controller
+
+if TYPE_CHECKING:
+    from stagectl.profile import Profile
 
 _REST_S = 1.0
 
 
-def controller_of(profile: Profile, law: str) -> Controller:
+def controller_of(profile: "Profile", law: str) -> Controller:
     """Make a controller for the value seam."""
     return tick.controller(profile, law, has_drives=False)
 
 
-def scan(controller: Controller, profile: Profile, machine: Machine, setpoints: np.ndarray, seed: int) -> Recording:
-    """Rest where the reference begins until the observer has settled, then follow it; RequestError where it stops.
-
-    The machine rests in the middle of the believed gap.
-    """
+def rested(controller: Controller, profile: "Profile", machine: Any, start_m: float, seed: int) -> Simulation:
+    """Rest with the end at `start_m`, the macro in the middle of the believed gap, until the observer has settled."""
     simulation = batch.simulation(controller, machine, latch_delay_s=profile.cycle.actuation_delay_s, seed=seed)
-    start_m = float(setpoints["position_m"][0])
     simulation.state["end_position_m"] = start_m
     simulation.state["macro_position_m"] = start_m + float(gap_centre(controller.belief[0]))
     rest = np.zeros(round(_REST_S * profile.cycle.rate_hz), SETPOINT)
     rest["position_m"] = start_m
     batch.run(simulation, rest)
-    recording = batch.run(simulation, setpoints)
+    return simulation
+
+
+def scan(controller: Controller, profile: "Profile", machine: Any, setpoints: np.ndarray, seed: int) -> Recording:
+    """Rest where the reference begins, then follow it. RequestError where the guard stops it."""
+    recording = batch.run(rested(controller, profile, machine, float(setpoints["position_m"][0]), seed), setpoints)
     stop = Stop(int(recording.commands["stop"][-1]))
     if stop is not Stop.NONE:
         raise RequestError(
