@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from stagectl.report import Figure
 
 Value = float | str | None
-"""A number in the row's unit (infinite: never reached), words where there is none ("diverges"), or None where the column
-does not apply."""
+"""A number in the row's unit (infinite: never reached), words where there is none ("diverges"), or None where the
+column does not apply."""
 
 
 @dataclass(frozen=True, slots=True)
