@@ -8,8 +8,9 @@ Micro, adaptive integral sliding mode (32)-(40):
     Omega' = (alpha k / r) s^2 - sigma (Omega - Omega_0), bounded, frozen in saturation   (40) corrected, E14
 
 with eta >= 2 sqrt(gamma) (E16). Known forces are those of the believed machine, predicted to the instant the
-command acts: spring, contact (its feed-forward), effects, and the observer's unknown force. Macro: state feedback
-on the centre of the gap (for (21), E11) with the micro's reaction decoupled (26), static with current drives.
+command acts: spring, contact (its feed-forward), effects, and the observer's unknown force; with it comes the mass
+that was found to be missing times the reference's acceleration at that instant (`stagectl.fed_forward`). Macro: state
+feedback on the centre of the gap (for (21), E11) with the micro's reaction decoupled (26), static with current drives.
 Pure; knows no bus and no clock.
 """
 
@@ -96,7 +97,7 @@ def init(profile: "Profile") -> np.ndarray:
 
 @compiled
 def integrand(e: float, phi: float) -> float:
-    """y(e) of (33), corrected: odd, slope 2 at 0, phi sgn e beyond phi."""
+    """Return y(e) of (33), corrected, m: odd, slope 2 at 0, phi sgn e beyond phi."""
     if e >= phi:
         return phi
     if e <= -phi:
@@ -127,7 +128,10 @@ def precision(
     q: Record,
     dt_s: float,
 ) -> float:
-    """Return the force of the axis that carries the end, N, within what its motor makes at its limits."""
+    """Return the force of the axis that carries the end, N, within what its motor makes at its limits: (27)-(32), (39).
+
+    Advances z of (32), m s, and the adaptive gain of (40), in r, where that force is within them.
+    """
     known_n += disturbance_n
     felt_s = felt_after_s(precise_current_loop_s(q), dt_s)
     acceleration = later.acceleration_m_per_s2 + felt_s * later.jerk_m_per_s3

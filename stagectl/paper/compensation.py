@@ -48,7 +48,7 @@ class Transfer:
 
 
 def end_denominator(q: Record) -> tuple[float, float, float, float]:
-    """Return A, B, C, E of (24) from (2)-(4)."""
+    """Return A, B, C, E of (24), the way of the end under U2, from (2)-(4); SI, highest power of s first."""
     return (
         float(q["micro_inductance_h"] * q["micro_mass_kg"]),
         float(q["micro_inductance_h"] * q["damping_n_s_per_m"] + q["micro_resistance_ohm"] * q["micro_mass_kg"]),
@@ -62,7 +62,10 @@ def end_denominator(q: Record) -> tuple[float, float, float, float]:
 
 
 def printed_decoupler(q: Record, coupling_ratio: float = 1.0) -> Transfer:
-    """Return (26) with K_c = `coupling_ratio` K_mw."""
+    """Return D21 of (26), V/V, with K_c = `coupling_ratio` K_mw.
+
+    It is what (22) and (23) make of (24) and (25): minus the end's way under U2 over the macro's under U1.
+    """
     ratio = -coupling_ratio * float(q["micro_force_constant_n_per_a"] / q["macro_force_constant_n_per_a"])
     mass, b1 = float(q["macro_mass_kg"]), float(q["base_damping_n_s_per_m"])
     inductance, resistance = float(q["macro_inductance_h"]), float(q["macro_resistance_ohm"])
@@ -72,7 +75,7 @@ def printed_decoupler(q: Record, coupling_ratio: float = 1.0) -> Transfer:
 
 
 def corrected_decoupler(q: Record) -> Transfer:
-    """Return the decoupler that undoes the voice coil's reaction with voltage drives, of its voltage less back-EMF."""
+    """Return what undoes the coil's reaction in place of (26), V/V: voltage drives, of U2 less the coil's back-EMF."""
     ratio = float(q["micro_force_constant_n_per_a"] / q["macro_force_constant_n_per_a"])
     return Transfer(
         (ratio * float(q["macro_inductance_h"]), ratio * float(q["macro_resistance_ohm"])),
@@ -82,7 +85,7 @@ def corrected_decoupler(q: Record) -> Transfer:
 
 @compiled
 def filtered(f: Record, value: float) -> float:
-    """Advance the filter by one sample."""
+    """Advance the filter of (26) by one sample; V to V."""
     b, a, z = f.numerator, f.denominator, f.state
     out = b[0] * value + z[0]
     z[0] = b[1] * value - a[1] * out + z[1]

@@ -122,7 +122,10 @@ def _run(platform: np.ndarray, dt_s: float, substeps: int, out: np.ndarray) -> i
 
 
 def run(platform: np.ndarray, duration_s: float, dt_s: float = 1e-3) -> Samples:
-    """Run the test from rest; rows end where the platform leaves +-1 km (a joint of the printed sign does)."""
+    """Run the test, (10), (11), from rest for some seconds.
+
+    Rows end where the platform leaves +-1 km (a joint of the printed sign does).
+    """
     out = np.zeros((round(duration_s / dt_s), 6))
     done = _run(platform, dt_s, _SUBSTEPS_COUNT, out)
     return Samples(dt_s, *(out[:done, k] for k in range(6)))

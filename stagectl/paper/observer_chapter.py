@@ -56,7 +56,7 @@ class Axis:
         return super_twisting.along(observer, self.position_m[first:], self.input_n[first:], self.dt_s)
 
     def force_n(self, observed: Observed) -> np.ndarray:
-        """Return F_b of (17)."""
+        """Return F_b of (17), N, shape (n,): chi of (15), (16) times the mass, with the axis' sign."""
         return self.sign * self.mass_kg * observed.chi_m_per_s2
 
 

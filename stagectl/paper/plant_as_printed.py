@@ -142,7 +142,7 @@ def accelerations(
 
 @inlined
 def currents(v1: float, v: float, i1: float, i2: float, u1: float, u2: float, q: Record) -> tuple[float, float]:
-    """Return the motors' currents for inputs u: the states of (3), or what (29) and a current drive make of u, A."""
+    """Return the motors' currents, A, for inputs u: states of (3), (4), or what (29) and a current drive make of u."""
     if q.drive == DRIVE_VOLTAGE:
         return i1, i2
     if q.drive == DRIVE_CURRENT:
@@ -157,7 +157,7 @@ def currents(v1: float, v: float, i1: float, i2: float, u1: float, u2: float, q:
 def _rates(
     x1: float, v1: float, x: float, v: float, i1: float, i2: float, u1: float, u2: float, external_n: float, q: Record
 ) -> tuple[float, float, float, float]:
-    """Return d1'', d'', di_h/dt, di_w/dt."""
+    """Return d1'', d'', m/s^2, of (1), (2) and di_h/dt, di_w/dt, A/s, of (3), (4)."""
     now1, now2 = currents(v1, v, i1, i2, u1, u2, q)
     macro, end = accelerations(
         x1, v1, x, v, q.macro_force_constant_n_per_a * now1, q.micro_force_constant_n_per_a * now2, external_n, q
@@ -169,7 +169,7 @@ def _rates(
 
 @compiled
 def advance(s: Record, q: Record, u1: float, u2: float, dt_s: float, count: int) -> None:
-    """Advance by `count` Runge-Kutta steps of `dt_s`, inputs held (V, or A with a current drive)."""
+    """Advance (1)-(5) by `count` Runge-Kutta steps of `dt_s`, inputs held (V, or A with a current drive)."""
     x1, v1 = s.macro_position_m, s.macro_velocity_m_per_s
     x, v = s.end_position_m, s.end_velocity_m_per_s
     i1, i2 = s.macro_current_a, s.micro_current_a

@@ -11,7 +11,7 @@ from stagectl.compiled import compiled, inlined
 
 @compiled
 def piecewise(x_b: float, left_m: float, right_m: float, left_n_per_m: float, right_n_per_m: float) -> float:
-    """F_b of (5), N: a spring beyond each edge, nothing between."""
+    """Return F_b of (5), N: a spring beyond each edge, nothing between; x_b and edges in m."""
     if x_b > right_m:
         return right_n_per_m * (x_b - right_m)
     if x_b < -left_m:
@@ -28,13 +28,13 @@ def damped(force_n: float, rate_m_per_s: float, damping_n_s_per_m: float) -> flo
 
 @compiled
 def state_factor(condition: float) -> float:
-    """delta_b of (6): 0 in the gap (condition > 0), 1 in contact."""
+    """Return delta_b of (6): 0 in the gap (condition, m, > 0), 1 in contact."""
     return 0.0 if condition > 0.0 else 1.0
 
 
 @compiled
 def marker(x_b: float, left_m: float, right_m: float) -> tuple[float, float, float, float]:
-    """h_b of (9) with the factors of (7): [x_b d_l, d_l, x_b d_r, -d_r], the minus in h."""
+    """Return h_b of (9), shape (4,), m or 1, with the factors of (7): [x_b d_l, d_l, x_b d_r, -d_r], the minus in h."""
     left = state_factor(x_b + left_m)
     right = state_factor(right_m - x_b)
     return x_b * left, left, x_b * right, -right
@@ -42,14 +42,14 @@ def marker(x_b: float, left_m: float, right_m: float) -> tuple[float, float, flo
 
 @compiled
 def quasi_linear(x_b: float, left_m: float, right_m: float, left_n_per_m: float, right_n_per_m: float) -> float:
-    """F_b of (8) and (9): h_b^T theta_b with theta_b = [K_l, K_l b_l, K_r, K_r b_r], N."""
+    """Return F_b of (8) and (9): h_b^T theta_b with theta_b = [K_l, K_l b_l, K_r, K_r b_r], N."""
     h = marker(x_b, left_m, right_m)
     return h[0] * left_n_per_m + h[1] * left_n_per_m * left_m + h[2] * right_n_per_m + h[3] * right_n_per_m * right_m
 
 
 @compiled
 def printed_condition(x_b: float, left_m: float, right_m: float, left_n_per_m: float, right_n_per_m: float) -> float:
-    """F_b of (8) with the left condition x_b - b_l as (7) shows it, N."""
+    """Return F_b of (8) with the left condition x_b - b_l as (7) shows it, N."""
     left = state_factor(x_b - left_m)
     right = state_factor(right_m - x_b)
     return left_n_per_m * (x_b + left_m) * left + right_n_per_m * (x_b - right_m) * right

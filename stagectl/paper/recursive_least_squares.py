@@ -66,7 +66,7 @@ def init(
     stiffness_n_per_m: float = FIRST_STIFFNESS_N_PER_M,
     edge_m: float = FIRST_EDGE_M,
 ) -> np.ndarray:
-    """Make RECURSION with P(0) = covariance I, in units of kN and m; first values as printed."""
+    """Make RECURSION of (20) with P(0) = covariance I, in units of kN and m; first values as printed."""
     r = np.zeros(1, RECURSION)
     first = stiffness_n_per_m / _N_PER_KN
     r["theta"] = (first, first * edge_m, first, first * edge_m)
@@ -77,7 +77,10 @@ def init(
 
 @compiled
 def step(r: Record, x_b_m: float, force_kn: float, left_m: float, right_m: float) -> None:
-    """Take one sample, marked with the given edges."""
+    """Take one sample into theta and P, (20): x_b in m, F_b in kN, marked by (6), (7), (9) with the given edges in m.
+
+    Shapes: theta and h (4,), P (4, 4); a sample in the gap (h = 0) changes nothing.
+    """
     h = marker(x_b_m, left_m, right_m)
     if h[1] == 0.0 and h[3] == 0.0:
         return
@@ -123,7 +126,7 @@ def _along(
 def along(
     recursion: np.ndarray, x_b_m: np.ndarray, force_n: np.ndarray, true: Backlash, knows_edges: bool = False
 ) -> Identified:
-    """Run (20) over samples; `knows_edges` marks them with the true edges, to show what the marking costs."""
+    """Run (20) over samples, shapes (n,); `knows_edges` marks them with the true edges, to show what that costs."""
     out = np.empty((x_b_m.size, 4))
     edges = np.array([true.left_m, true.right_m])
     _along(recursion, x_b_m, force_n / _N_PER_KN, edges, knows_edges, out)

@@ -61,7 +61,7 @@ def corrected(values: SlidingModeValues = CONTROL_5_3, leak_per_s: float = 2.0) 
 
 @inlined
 def printed_integrand(e: float, phi: float) -> float:
-    """y(e) of (33) as printed."""
+    """Return y(e) of (33) as printed, m, of e and phi in m."""
     if e >= phi:
         return phi
     if e <= -phi:
@@ -82,7 +82,11 @@ def wanted_force(
     contact_n: float,
     q: Record,
 ) -> float:
-    """Return the force that (39) asks of the voice coil, N."""
+    """Return the force that (39) asks of the voice coil, N, and leave e, e' and s of (31), (32) in `law`.
+
+    Of the plant as (27) has it, without m2 d1'', in which (30) puts the coil's current (28), (29): the voltage of (39),
+    R_w / K_mw F + K_emfw (d' - d1'), is made of this force where a drive takes volts. x1, v1: macro, m, m/s; x, v: end.
+    """
     e = x - position_m
     rate = v - velocity_m_per_s
     y = integrand(e, law.phi_m) if law.corrected_y != 0.0 else printed_integrand(e, law.phi_m)
@@ -96,7 +100,7 @@ def wanted_force(
 
 @inlined
 def adapt(law: Record, saturated: bool, dt_s: float) -> None:
-    """Advance the integral of (32) and the bound of (40) by one period."""
+    """Advance the integral of (32), m s, and the bound Omega of (40), N, by one period; neither where it freezes."""
     if saturated and law.freezes != 0.0:
         return
     y = integrand(law.error_m, law.phi_m) if law.corrected_y != 0.0 else printed_integrand(law.error_m, law.phi_m)
@@ -122,19 +126,19 @@ def reaching_band_m_per_s(values: SlidingModeValues = CONTROL_5_3) -> float:
 
 
 def sliding_energy(sliding_m_per_s: np.ndarray, mass_kg: float) -> np.ndarray:
-    """Return V1 = m2 s^2 / 2 of (34), J."""
+    """Return V1 = m2 s^2 / 2 of (34), J, shape (n,)."""
     return 0.5 * mass_kg * sliding_m_per_s**2
 
 
 def adaptive_energy(
     sliding_m_per_s: np.ndarray, doubt_n: np.ndarray, mass_kg: float, values: SlidingModeValues = CONTROL_5_3
 ) -> np.ndarray:
-    """Return V2 = V1 + doubt^2 / (2 alpha) of (37); doubt (36): the estimated less the true bound of the force."""
+    """Return V2 = V1 + doubt^2 / (2 alpha) of (37), J, shape (n,); doubt (36), N: estimated less true bound."""
     return sliding_energy(sliding_m_per_s, mass_kg) + doubt_n**2 / (2.0 * values.alpha)
 
 
 def error_energy_m2(error_m: np.ndarray) -> np.ndarray:
-    """Return V3 = e^2 / 2 of (43)."""
+    """Return V3 = e^2 / 2 of (43), m^2, shape (n,)."""
     return 0.5 * error_m**2
 
 

@@ -63,7 +63,10 @@ def init(
 
 @compiled
 def step(o: Record, position_m: float, input_n: float, dt_s: float) -> None:
-    """Filter (16) and advance (12) by one sample."""
+    """Filter chi of (16), m/s^2, by the low-pass of 5.2 and advance (12) by one sample; (14), (15) are what it obeys.
+
+    Position in m, known force in N; errors x1~ = x1 - x1^ of 0 switch nothing.
+    """
     error = position_m - o.position_m
     sign = 1.0 if error > 0.0 else (-1.0 if error < 0.0 else 0.0)
     switched = o.iota_m_per_s2 * sign
@@ -85,7 +88,7 @@ def _along(observer: np.ndarray, position_m: np.ndarray, input_n: np.ndarray, dt
 
 
 def along(observer: np.ndarray, position_m: np.ndarray, input_n: np.ndarray, dt_s: float) -> Observed:
-    """Run the observer over samples of position and known input force; states are those before each sample."""
+    """Run (12)-(16) over samples of position, m, and known force, N, shapes (n,); states are those before each."""
     out = np.empty((position_m.size, 3))
     _along(observer, position_m, input_n, dt_s, out)
     return Observed(out[:, 0], out[:, 1], out[:, 2])
@@ -98,21 +101,23 @@ def is_enough(gains: ObserverGains, bound_m_per_s2: float) -> bool:
 
 
 def gains_for(bound_m_per_s2: float, iota_ratio: float = 2.0, margin_ratio: float = 1.05) -> ObserverGains:
-    """Return gains that keep (13) for accelerations up to C, with iota = `iota_ratio` C."""
+    """Return gains that keep (13) for accelerations up to C, m/s^2, with iota = `iota_ratio` C."""
     iota = iota_ratio * bound_m_per_s2
     least = 2.0 * np.sqrt(bound_m_per_s2 * (iota + bound_m_per_s2) / (iota - bound_m_per_s2))
     return ObserverGains(margin_ratio * float(least), iota)
 
 
 def largest_bound_m_per_s2(gains: ObserverGains) -> float:
-    """Return the largest C for which gains keep (13): the root of 4 C (iota + C) = eta^2 (iota - C)."""
+    """Return the largest C, m/s^2, for which gains keep (13): the root of 4 C (iota + C) = eta^2 (iota - C)."""
     iota, square = gains.iota_m_per_s2, gains.eta**2
     half = iota + 0.25 * square
     return 0.5 * (-half + float(np.sqrt(half * half + square * iota)))
 
 
 def time_bound_s(gains: ObserverGains, bound_m_per_s2: float, cycles_s: np.ndarray) -> float | None:
-    """Return the bound (18), (19) from the durations of the error's oscillations; None where iota <= C: no bound.
+    """Return the bound (18), (19), s, from the durations of the error's oscillations, s, shape (n,).
+
+    None where iota <= C: no bound.
 
     Its fraction is placed by dimensions: sum of 2 (iota + C)^2 / (2 (iota + C) + eta^2) t_j, over iota - C.
     """
@@ -124,7 +129,7 @@ def time_bound_s(gains: ObserverGains, bound_m_per_s2: float, cycles_s: np.ndarr
 
 
 def cycles_s(error: np.ndarray, dt_s: float) -> np.ndarray:
-    """Return the durations of whole oscillations of an observation error: between every second change of its sign.
+    """Return the durations t_j of (18), (19), s: of whole oscillations, between every second change of an error's sign.
 
     The first begins with the first sample, where the error begins to oscillate.
     """
