@@ -279,6 +279,21 @@ def test_a_slower_actuator(delay, lag, dead, expected):
 # ---- drawn sets --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("speed", [2e-3, 0.05])
+@pytest.mark.parametrize("moved_m", [1e-8, 1e-6])
+@pytest.mark.parametrize("phase", [0.1, 0.35, 0.8])
+def test_an_edge_that_moves_takes_its_share_of_an_impact(speed, moved_m, phase):
+    """Met later by d / v: the impulse is less by c d and, over what follows, by k d t (up to k d^2 / 2 v)."""
+    k, c, edge = 2e4, 100.0, 1e-5
+    r = edge + speed * (np.arange(60) - 30.0 + phase) * detection.CELL_S
+    there, at = np.full(r.size, speed), np.array([k, k, edge, edge, c])
+    moved = np.array([k, k, edge, edge + moved_m, c])
+    lost_n_s = np.sum(detection._stops(r, there, at) - detection._stops(r, there, moved)) * detection.CELL_S
+    behind_s = (60.0 - 30.0 + phase - 0.5) * detection.CELL_S
+    expected = c * moved_m + k * moved_m * behind_s - 0.5 * k * moved_m**2 / speed
+    assert lost_n_s == pytest.approx(expected, rel=2e-3)
+
+
 def test_the_coloured_force_has_its_rms_and_band():
     rng = np.random.default_rng(5)
     forces = np.array([draw.coloured_force(rng, 20_000) for _ in range(60)])
