@@ -467,8 +467,8 @@ def _stop(r, i, speed, contact):
     """The same of cell `i`.
 
     A cell that an edge is passed in counts by the share of it that lies behind the edge. By its middle alone it would
-    count wholly or not at all: moved by 10 nm, an edge passed at 50 mm/s (12 um a cell) was most often not seen to move,
-    and once in a thousand times to move by all of a cell.
+    count wholly or not at all: moved by 10 nm, an edge passed at 50 mm/s (12 um a cell) was most often not seen to
+    move, and once in a thousand times to move by all of a cell.
     """
     low = 0.5 * (r[i - 1] + r[i]) if i > 0 else r[i]
     high = 0.5 * (r[i] + r[i + 1]) if i < len(r) - 1 else r[i]
