@@ -35,7 +35,7 @@ REST_M_PER_S = 1e-3
 STANDSTILL_M = 20e-6
 POLL_S = 0.05
 TRIP = stage_child.patient_profile().trip
-_TRIES = 4
+_TRIES = 8
 WAKE_NS = 2_000_000  # lateness of the rig's and the servo's own wake-ups that nobody counts
 
 
@@ -136,10 +136,12 @@ class Child:
         """Whom to ask what is true."""
         return Witness(self.hear("channel"), self.folder.parent)
 
-    def hear(self, key: str):
-        """Return the value of the first message that has the key."""
+    def hear(self, key: str, unless: str = ""):
+        """Return the value of the first message that has the key; None where one that has the key `unless` comes."""
         until_s = time.monotonic() + PATIENCE_S
         while key not in self.facts:
+            if unless in self.facts:
+                return None
             ready, _, _ = select.select([self.process.stdout], [], [], max(0.0, until_s - time.monotonic()))
             line = self.process.stdout.readline() if ready else ""
             assert line, f"the child said no {key!r}: {self.facts}, ended with {self.process.poll()}"
@@ -169,7 +171,7 @@ def child(tmp_path):
     for attempt in range(_TRIES):
         made = Child(tmp_path / f"run-{attempt}")
         try:
-            moves = made.hear("moving")
+            moves = made.hear("moving", unless="ended")
             if moves and abs(made.witness.state()["plant"]["macro_velocity_m_per_s"]) > 0.9 * SPEED_M_PER_S:
                 yield made
                 return

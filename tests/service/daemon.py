@@ -16,6 +16,7 @@ from stagectl.profile import PROFILES_FOLDER
 from tests.toml_text import changed
 
 PATIENCE_S = 90.0
+_HICCUPS = 3
 REST_M_PER_S = 1e-3
 PATIENT = {  # limits that a busy test host does not pass
     "trip.sensor_age_s": 0.3,
@@ -90,6 +91,16 @@ class Daemon:
         self.state_is("idle")
         self.until(lambda: self.client.lease_token or self.client.lease_state() is None, "a free lease")
         return True
+
+    def finishes(self, motion):
+        """Ask for a motion until it ends as it should; a drive's emergency that a hiccup made gets it another try."""
+        for _ in range(_HICCUPS):
+            stop = motion().stop
+            if stop == "FINISHED":
+                return
+            assert stop == "EMERGENCY", stop
+            assert self.recovers()
+        raise AssertionError(f"{_HICCUPS} emergencies in a row: {(self.folder / 'err').read_text()[-2000:]}")
 
     @property
     def plant(self):
