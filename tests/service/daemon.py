@@ -85,6 +85,7 @@ class Daemon:
         fault = self.client.fault()
         if fault is None:
             return False
+        self.until(lambda: self.client.lease_token or self.client.lease_state() is None, "a free lease")
         held = contextlib.nullcontext() if self.client.lease_token else self.client.lease("after a hiccup")
         with held:
             self.client.acknowledge(fault.number)
