@@ -1,5 +1,6 @@
 """The rig on wires of the operating system: a SocketCAN interface, and a serial port that it writes to."""
 
+import contextlib
 import errno
 import os
 import socket
@@ -10,6 +11,7 @@ from pathlib import Path
 from stagectl.errors import LinkError
 
 _BAUD_CODES = {9600.0: termios.B9600, 115_200.0: termios.B115200, 921_600.0: termios.B921600}
+_ECHO_BYTES = 4096
 _NOT_THERE = (errno.ENODEV, errno.ENXIO)
 
 
@@ -33,7 +35,8 @@ def can_link(interface: str) -> socket.socket | None:
 class UartPort:
     """Writes whole lines to a serial port, or to another device that takes bytes (the port of a virtual machine).
 
-    What that doesn't take is lost, and nobody waits.
+    What that doesn't take is lost, and nobody waits. What comes back is heard and ignored: a tty that was just opened
+    echoes lines, and a virtual machine stood still for good when nobody took 200 kB of its echo.
     """
 
     def __init__(self, path: str | Path, baud_bit_per_s: float) -> None:
@@ -42,7 +45,7 @@ class UartPort:
         self._is_plugged = True
         self._port = -1
         try:
-            self._port = os.open(path, os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+            self._port = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
             if os.isatty(self._port):
                 self._configure(baud_bit_per_s)
         except KeyError:
@@ -73,12 +76,18 @@ class UartPort:
         if not self._is_plugged:
             return
         try:
+            self._ignore_echo()
             written = os.write(self._port, line)
         except BlockingIOError:
             written = 0
         except OSError as error:
             raise LinkError(f"{self.path}: writing the rig's lines failed: {error}; restart the rig") from error
         self.lines_lost_count += written < len(line)
+
+    def _ignore_echo(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            while os.read(self._port, _ECHO_BYTES):
+                pass
 
     def close(self) -> None:
         """Close the port."""

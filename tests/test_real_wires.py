@@ -63,6 +63,17 @@ def test_what_nobody_takes_is_lost_and_counted(wire):
     port.close()
 
 
+def test_what_comes_back_never_fills_the_line(wire):
+    path, reader = wire
+    port = UartPort(path, 115_200.0)
+    for _ in range(3000):
+        assert os.write(reader, bytes(25)) == 25
+        port.write(b"line\n")
+        os.read(reader, 100)
+    assert port.lines_lost_count == 0
+    port.close()
+
+
 @pytest.mark.parametrize(
     ("path", "baud_bit_per_s", "said"),
     [("/dev/none", 115_200.0, "choose another --uart"), (None, 12_345.0, "12345 baud is none of 9600")],
