@@ -44,7 +44,7 @@ boot() { # NAME OPTIONS
   echo "$name" >"$folder/share/machine"
   printf '%s\n' "${GUEST_CHECKS:-}" >"$folder/share/only"
   : >"$folder/share/log"
-  timeout "$LIMIT_S" qemu-system-x86_64 "$@" -m 3072 -display none -no-reboot -nic none -monitor none \
+  timeout --kill-after=20 "$LIMIT_S" qemu-system-x86_64 "$@" -m 3072 -display none -no-reboot -nic none -monitor none \
     -pidfile "$folder/pid" -kernel "$FOLDER/vmlinuz" -initrd "$FOLDER/initrd" \
     -append "console=ttyS0 root=/dev/vda rw quiet loglevel=4 systemd.show_status=0 panic=-1 mitigations=off random.trust_cpu=on audit=0 apparmor=0 net.ifnames=0 tsc=reliable isolcpus=1" \
     -drive "file=$FOLDER/disk,if=virtio,format=raw,snapshot=on" \
