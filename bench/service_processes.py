@@ -1,5 +1,6 @@
 """Faults with real processes, what a recording loses, and the memory of a long session."""
 
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -39,6 +40,7 @@ def figures(*, full: bool, say: Say, seeds: Sequence[int] | None = None) -> Iter
             if seed in journal.entries:
                 continue
             result = real.run(seed, Path(folder) / str(seed))
+            shutil.rmtree(Path(folder) / str(seed), ignore_errors=True)
             journal.keep(
                 seed,
                 {

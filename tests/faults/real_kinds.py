@@ -38,6 +38,7 @@ class Kind:
     without_power: bool = False
     lasts_s: float = 0.0
     by_drives: bool = False  # the drives stop it by themselves: how late the servo was is no excuse
+    open_loop: bool = False  # the drive keeps its last force until the fault is noticed
     disk_bytes: int = 0  # of a disk of its own for the runs; 0 = none
 
 
@@ -190,19 +191,19 @@ def _rig(**fault) -> Callable[[House], None]:
 
 
 KINDS: dict[str, Kind] = {
-    "servo killed": Kind(killed_child, RPDO_S, by_drives=True),
+    "servo killed": Kind(killed_child, RPDO_S, by_drives=True, open_loop=True),
     "supervisor killed": Kind(killed_supervisor, SUPERVISOR_S),
-    "both killed": Kind(killed_both, RPDO_S, by_drives=True),
-    "servo stopped": Kind(stopped_child, RPDO_S, lasts_s=3.5, by_drives=True),
+    "both killed": Kind(killed_both, RPDO_S, by_drives=True, open_loop=True),
+    "servo stopped": Kind(stopped_child, RPDO_S, lasts_s=3.5, by_drives=True, open_loop=True),
     "supervisor stopped": Kind(stopped_supervisor, SUPERVISOR_S, lasts_s=1.6),
     "client vanishes in mid jog": Kind(client_vanishes, LEASE_S, lasts_s=2.5),
     "beam break": Kind(_rig(kind="beam_loss", axis="macro", duration_s=0.5), 3 * CYCLE_S, lasts_s=0.5),
     "unplug and replug": Kind(_rig(kind="unplug", duration_s=0.5), 3 * CYCLE_S, lasts_s=0.6),
     "bus-off and back": Kind(_rig(kind="bus_off", duration_s=0.4), 3 * CYCLE_S, lasts_s=0.4),
-    "interferometer silent": Kind(_rig(kind="sensor_silence", duration_s=0.6), SENSOR_S, lasts_s=0.6),
+    "interferometer silent": Kind(_rig(kind="sensor_silence", duration_s=0.6), SENSOR_S, lasts_s=0.6, open_loop=True),
     "EMCY": Kind(_rig(kind="emergency", node_id=1, code=0x7305), 3 * CYCLE_S),
     "drive reboot": Kind(_rig(kind="power_loss", node_id=1, duration_s=0.5), SENSOR_S, without_power=True, lasts_s=0.6),
-    "frames lost": Kind(_rig(kind="drop_frame", can_id=0x201, duration_s=0.5), RPDO_S, lasts_s=0.5),
+    "frames lost": Kind(_rig(kind="drop_frame", can_id=0x201, duration_s=0.5), RPDO_S, lasts_s=0.5, open_loop=True),
     "drive's heartbeat lost": Kind(
         _rig(kind="heartbeat_silence", node_id=1, duration_s=3.0), HEARTBEAT_S + 0.3, lasts_s=3.2
     ),

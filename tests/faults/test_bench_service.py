@@ -70,6 +70,9 @@ def test_the_bound_of_a_run_with_real_processes():
     """t = 0.1 + 0.001 + 0.01 s at 0.12 m/s, ramp 5 m/s^2: 13.32 + 1.44 mm."""
     moving = {"macro_velocity_m_per_s": -0.12, "macro_position_m": 0.05}
     assert real._bound_m(real.KINDS["servo killed"], moving, 0.01) == pytest.approx(14.76e-3, abs=0.01e-3)
+    driven = moving | {"macro_position_m": 0.062}  # magnets of 2 N on 12 kg, and the drive keeps what balanced them
+    assert real._bound_m(real.KINDS["servo killed"], driven, 0.01) == pytest.approx(16.05e-3, abs=0.01e-3)
+    assert real._bound_m(real.KINDS["EMCY"], driven, 0.107) == pytest.approx(14.76e-3, abs=0.01e-3)
     coasts = real._bound_m(real.KINDS["drive reboot"], moving, 0.01)
     assert coasts == pytest.approx(0.05 + 0.17 + 0.008)
 
