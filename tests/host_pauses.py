@@ -36,8 +36,10 @@ class HostPauses:
         self._test = ""
         self._excused: dict[str, list[str]] = defaultdict(list)
 
-    def excuse(self) -> bool:
-        """Whether a processor was away since this attempt at a test began."""
+    def excuse(self, error: BaseException | None) -> bool:
+        """Whether a processor was away since an attempt at a test began that failed with `error`; None: it passed."""
+        if error is None:
+            return False
         time.sleep(2.0 * (host_listener.SLEEP_S + host_listener.PAUSE_S))  # a pause that has not ended yet
         self._report.seek(0)
         pauses_s = [woke_s - slept_s for slept_s, woke_s in map(json.loads, self._report) if woke_s > self._began_s]
