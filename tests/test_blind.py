@@ -453,6 +453,24 @@ def test_the_closed_loop_shows_what_the_balance_says(touching, name, acts_on, va
     assert np.linalg.norm(after - before - mark) < 0.05 * np.linalg.norm(mark) + 0.5
 
 
+@pytest.mark.parametrize(
+    ("name", "acts_on", "values"),
+    [
+        ("scale_error", "end_sensor", {"relative": 8e-6}),
+        ("abbe_error", "macro_sensor", {"error_at_100_mm_m": -0.8e-6}),
+        ("backlash_centre", "contact", {"shift_m": 2e-6}),
+    ],
+)
+def test_no_size_tells_a_law_from_itself(touching, monkeypatch, name, acts_on, values):
+    """A reading that is wrong by a micrometre is told from one wrong by 20 um; both are the law, at its own size."""
+    law = laws.BY_NAME[name]
+    evidence = detection.Evidence(touching, draw.simulate(touching, []), 150.0)
+    signal = evidence.whitened([evidence.law_channels(run, law, acts_on, values) for run in evidence.runs])
+    monkeypatch.setattr(detection.laws, "LIBRARY", [law])
+    whole = math.sqrt(evidence.inner(signal, signal))
+    assert evidence.distances(signal)[name, acts_on] < 0.05 * whole
+
+
 def test_a_whitened_null_is_white(touching):
     """The balance of a null set, whitened by the stated spectra, has unit variance but for the taper's share."""
     runs = draw.simulate(touching, [])

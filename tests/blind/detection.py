@@ -32,6 +32,10 @@ CELL_S = SAMPLE_S / CELLS
 # a cell's weight in the force that the second difference of positions sees: a triangle of one sample to either side
 _UP = (np.arange(CELLS) + 0.5) / CELLS / CELLS
 _DOWN = _UP[::-1].copy()
+SLOPE_SHARE = 1e-3  # of a middle size: there a law is its slope
+SIZE_STARTS = (0.25, 1.0, 4.0)  # of a middle size
+SIZE_ROUNDS = 5
+EDGE_LAWS = ("backlash_centre", "backlash_wear")
 NONLINEAR = ("soft_contact", "sensor_delay", "sensor_lag", "command_delay", "current_loop_lag", "amplifier_dead_band")
 
 
@@ -379,12 +383,35 @@ class Evidence:
         solution = np.linalg.lstsq(gram / np.outer(scale, scale), target / scale, rcond=1e-10)[0]
         return math.sqrt(max(whole - float((target / scale) @ solution), 0.0))
 
+    def _rest_after_best_size(self, signal, at_size, size, signed):
+        """Distance d of `signal` from a law whose column turns with its size: at the size that it asks for.
+
+        Readings that are 20 um wrong put a body behind an edge that those which are 1 um wrong don't. From a slope and
+        from a few sizes on, the nearest one is followed.
+        """
+
+        def at(size):
+            column = at_size(size)
+            whole = self.inner(column, column)
+            share = self.inner(signal, column) / whole if whole > 0.0 else 0.0
+            return self.rest_after(signal, [column], signed), size * share
+
+        starts = [SLOPE_SHARE, *SIZE_STARTS, *([-start for start in SIZE_STARTS] if signed else [])]
+        nearest, asked = min(at(start * size) for start in starts)
+        for _ in range(SIZE_ROUNDS):
+            if asked == 0.0 or (asked < 0.0 and not signed):
+                break
+            distance, asked = at(asked)
+            nearest = min(nearest, distance)
+        return nearest
+
     # ---- alternatives ----
 
     def alternatives(self, hints=()):
-        """Every library law at every place, over a grid of its parameters: (name, acts_on, signed, columns).
+        """Every library law at every place, over a grid of its parameters: (name, acts_on, signed, columns, at_size).
 
-        hints: effects whose pitches and frequencies join the grids of the periodic laws.
+        hints: effects whose pitches and frequencies join the grids of the periodic laws. at_size: where columns don't
+        grow with the law's size alone, (what gives its column at a size, a middle size); else None.
         """
         for law in laws.LIBRARY:
             if self.case.single and not law.single_axis:
@@ -416,12 +443,18 @@ class Evidence:
             if all(parameter.name not in point for point in points) and "phase" not in parameter.spread:
                 points = [point | {parameter.name: math.sqrt(parameter.low * parameter.high)} for point in points]
         phase = next((parameter for parameter in law.parameters if "phase" in parameter.spread), None)
+        moves_edges = not self.case.single and (law.family == "sensor" or law.name in EDGE_LAWS)
         for size in sizes:
             for point in points:
                 values = {first.name: size} | point
                 if phase is None:
-                    column = self.whitened([self.law_channels(run, law, acts_on, values) for run in self.runs])
-                    yield law.name, acts_on, law.signed, [column]
+
+                    def at_size(size, point=point):
+                        values = {first.name: size} | point
+                        return self.whitened([self.law_channels(run, law, acts_on, values) for run in self.runs])
+
+                    sized = (at_size, middle) if moves_edges and size == sizes[0] else None
+                    yield law.name, acts_on, law.signed, [at_size(size)], sized
                     continue
                 columns = []
                 groups = sorted({run.homing if phase.spread == "phase" else run.number for run in self.runs})
@@ -433,13 +466,15 @@ class Evidence:
                             for run, own in zip(self.runs, channels, strict=True)
                         ]
                         columns.append(self.whitened(part))
-                yield law.name, acts_on, True, columns
+                yield law.name, acts_on, True, columns, None
 
     def distances(self, signal, hints=()):
         """{(name, acts_on): smallest distance of `signal` from that law over its grid}, parameter errors included."""
         nearest = {}
-        for name, acts_on, signed, columns in self.alternatives(hints):
+        for name, acts_on, signed, columns, sized in self.alternatives(hints):
             distance = self.rest_after(signal, columns, signed)
+            if sized is not None:
+                distance = min(distance, self._rest_after_best_size(signal, *sized, signed))
             key = (name, acts_on)
             nearest[key] = min(nearest.get(key, math.inf), distance)
         for key, names in PARAMETER_ERRORS.items():
