@@ -33,7 +33,7 @@ from stagectl.errors import DriveError, LinkError, ProfileError, RecordError, Ti
 from stagectl.profile import Profile
 from stagectl.replay import describe_mapping
 from stagectl.requests import REQUEST, RESTING, STATUS, Mode
-from stagectl.ring import RequestReader, RequestWriter, RingReader, RingWriter
+from stagectl.ring import SHARED_MEMORY, RequestReader, RequestWriter, RingReader, RingWriter
 from stagectl.servo import RELEASE_CYCLES, Servo
 from stagectl.signals import SETPOINT
 from stagectl.tracker import Tracker
@@ -110,7 +110,6 @@ _END_S = 20.0
 _SYNC_STEP_NS = 230_000
 _SYNC_PATIENCE_NS = 460_000  # two RPDOs and SYNC take 220 us; longer means that the bus does not carry it
 
-_SHARED_MEMORY = Path("/dev/shm")
 
 RIG_VENDOR_ID = 0x5254
 """Identity of the rig's drives; hardware never shows it."""
@@ -410,7 +409,7 @@ class RealtimeBackend:
         self.wait_warm()
         token = f"{os.getpid()}-{secrets.token_hex(4)}"
         blocks = ("ring", "requests", "status", "segments")
-        paths = {name: _SHARED_MEMORY / f"stagectl-{token}.{name}" for name in blocks}
+        paths = {name: SHARED_MEMORY / f"stagectl-{token}.{name}" for name in blocks}
         self._paths = paths
         segments = np.memmap(paths["segments"], dtype=SETPOINT, mode="w+", shape=(SEGMENT_ROWS,))
         requests = RequestWriter(paths["requests"], REQUEST)

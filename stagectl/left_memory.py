@@ -7,10 +7,12 @@ import os
 import re
 from pathlib import Path
 
+from stagectl.ring import SHARED_MEMORY
+
 _BLOCK = re.compile(r"stagectl-(\d+)-[0-9a-f]+\.(requests|segments|status)")
 
 
-def remove_left_blocks(folder: Path = Path("/dev/shm")) -> list[Path]:
+def remove_left_blocks(folder: Path = SHARED_MEMORY) -> list[Path]:
     """Remove the blocks of dead supervisors beside which no ring lies any more; returns them.
 
     While there is a ring its servo may still bring a stage to rest by them. What is another user's stays.

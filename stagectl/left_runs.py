@@ -7,13 +7,11 @@ from pathlib import Path
 
 from stagectl.errors import RecordError
 from stagectl.record import SAMPLES, Recovery, finish_left, read_manifest
-from stagectl.ring import RingReader
+from stagectl.ring import SHARED_MEMORY, RingReader, own_rings
 from stagectl.whole_file import is_held
 
-_SHARED_MEMORY = Path("/dev/shm")
 
-
-def finish_left_runs(runs_root: Path, ring_folder: Path = _SHARED_MEMORY) -> list[tuple[Path, Recovery | RecordError]]:
+def finish_left_runs(runs_root: Path, ring_folder: Path = SHARED_MEMORY) -> list[tuple[Path, Recovery | RecordError]]:
     """Mark the service's runs that nobody records any more; a run that a ring still has rows of waits for them.
 
     To be called before a session begins. Returns (folder, what came of it) for each; how many rows the loss of power
@@ -42,7 +40,7 @@ def finish_left_runs(runs_root: Path, ring_folder: Path = _SHARED_MEMORY) -> lis
 def _awaited(ring_folder: Path) -> set[Path]:
     """Return the folders that rings lead to, through a session's link where there is one."""
     folders: set[Path] = set()
-    for ring_path in ring_folder.glob("stagectl-*.ring"):
+    for ring_path in own_rings(ring_folder):
         try:
             folder = RingReader(ring_path).run_folder
         except RecordError:  # just gone, or none of this version

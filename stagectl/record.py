@@ -19,7 +19,7 @@ import structlog
 
 from stagectl.errors import RecordError
 from stagectl.onto_disk import OntoDisk
-from stagectl.ring import RingReader, writer_alive
+from stagectl.ring import SHARED_MEMORY, RingReader, own_rings, writer_alive
 from stagectl.row import ROW, layout_hash
 from stagectl.samples_file import (
     BATCH_NS,
@@ -596,13 +596,13 @@ def _finish_recovered(folder: Path, manifest: dict, recovery: Recovery) -> None:
     (folder / _RESERVE).unlink(missing_ok=True)
 
 
-def recover_orphans(ring_folder: Path = Path("/dev/shm")) -> list[tuple[Path, Recovery | RecordError]]:
-    """Recover every `stagectl-*.ring` whose servo is dead into the run that it names; one bad ring stops no other.
+def recover_orphans(ring_folder: Path = SHARED_MEMORY) -> list[tuple[Path, Recovery | RecordError]]:
+    """Recover each ring of this user whose servo is dead into the run that it names; one bad ring stops no other.
 
     Returns (ring, what was saved or why not) for each.
     """
     outcomes: list[tuple[Path, Recovery | RecordError]] = []
-    for ring_path in sorted(Path(ring_folder).glob("stagectl-*.ring")):
+    for ring_path in own_rings(Path(ring_folder)):
         if writer_alive(ring_path):
             continue
         try:

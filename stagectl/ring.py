@@ -9,6 +9,7 @@ import errno
 import fcntl
 import mmap
 import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -23,6 +24,8 @@ from stagectl.whole_file import is_held
 
 RING_ROWS_COUNT = 16_384
 """16.4 s at 1 kHz, 20 MB: the supervisor may be away for 10 s."""
+
+SHARED_MEMORY = Path("/dev/shm")
 
 _RING_MAGIC = b"sctlring"
 _REQUEST_MAGIC = b"sctlrqst"
@@ -223,6 +226,22 @@ def _attach(path: Path, magic: bytes, dtype: np.dtype, kind: str) -> _Memory:
 def writer_alive(path: Path) -> bool:
     """Tell whether a process still writes the ring or request block at `path`; False where there is no file."""
     return is_held(path)
+
+
+def own_rings(folder: Path = SHARED_MEMORY) -> list[Path]:
+    """Return the rings of this user: everybody may put files into shared memory, and what others put there is theirs.
+
+    A named pipe would be waited for, another's ring can't be opened, and rows of a stranger's would go into our run.
+    """
+    found = []
+    for path in sorted(folder.glob("stagectl-*.ring")):
+        try:
+            status = path.lstat()
+        except FileNotFoundError:
+            continue
+        if stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid():
+            found.append(path)
+    return found
 
 
 class RingWriter:

@@ -16,6 +16,7 @@ import pyarrow as pa
 import pytest
 
 from stagectl.errors import RecordError
+from stagectl.left_runs import finish_left_runs
 from stagectl.record import (
     RESERVE_BYTES,
     Recorder,
@@ -589,6 +590,30 @@ def test_orphans_are_found_and_one_bad_ring_stops_no_other(tmp_path):
     assert set(outcomes) == {"stagectl-a.ring", "stagectl-b.ring", "stagectl-c.ring"}
     assert sorted(path.name for path in shared.iterdir()) == ["stagectl-a.ring", "stagectl-c.ring", "stagectl-d.ring"]
     living.close()
+
+
+@pytest.mark.parametrize("whose", ["a pipe", "a link", "another's"])
+def test_what_others_put_into_shared_memory_is_left_alone(tmp_path, monkeypatch, whose):
+    shared = tmp_path / "shm"
+    shared.mkdir()
+    path = shared / "stagectl-1-a.ring"
+    if whose == "a pipe":
+        os.mkfifo(path)
+    else:
+        ring = RingWriter(tmp_path / "ring", slots_count=64, run_folder=tmp_path / "run")
+        write_rows(ring, noisy_rows(20))
+        ring.close()
+        if whose == "a link":
+            path.symlink_to(tmp_path / "ring")
+        else:
+            (tmp_path / "ring").rename(path)
+            own = os.geteuid()
+            monkeypatch.setattr(os, "geteuid", lambda: own + 1)
+    Recorder(tmp_path / "run", {}).abandon()
+    assert recover_orphans(shared) == []
+    assert finish_left_runs(tmp_path, shared) == []
+    assert len(read_run(tmp_path / "run").rows) == 0
+    assert path in shared.iterdir()
 
 
 def started(*arguments):

@@ -4,10 +4,8 @@ from pathlib import Path
 
 from stagectl.errors import RecordError
 from stagectl.profile import Profile
-from stagectl.ring import RingReader, writer_alive
+from stagectl.ring import RingReader, own_rings, writer_alive
 from stagectl.stage import present
-
-_SHARED_MEMORY = Path("/dev/shm")
 
 
 def missing(profile: Profile, backend: str, runs_root: Path) -> str:
@@ -17,7 +15,7 @@ def missing(profile: Profile, backend: str, runs_root: Path) -> str:
         return f"{', '.join(absent)}: not there; plug it in, or ask for another backend"
     if not present(profile, backend):
         return ""
-    for ring in sorted(_SHARED_MEMORY.glob("stagectl-*.ring")):
+    for ring in own_rings():
         try:
             reader = RingReader(ring)
         except RecordError:
