@@ -154,10 +154,14 @@ class FlightRecorder:
         with self._policy():
             folder = self._reserve(name)
             begun = {**self._manifest, "trigger": trigger, "start_t_ns": t_ns}
-            self._run = Recorder(folder, begun, durable=True)
-            self._run.event("begin", t_ns, trigger=trigger)
-            self._lead_to(folder)
-            self.trigger, self.trouble = trigger, ""
+            run = Recorder(folder, begun, durable=True)
+            try:
+                run.event("begin", t_ns, trigger=trigger)
+                self._lead_to(folder)
+            except RecordError:
+                run.abandon()  # else it would record on without anybody to end it
+                raise
+            self._run, self.trigger, self.trouble = run, trigger, ""
 
     def end_run(self, end: Mapping[str, Any] | None = None) -> Path | None:
         """Close the run under way and return its folder; None where there was none. Errors: RecordError."""

@@ -163,7 +163,7 @@ class Homing(StreamMotion):
         master.write(node, cia402.HOMING_SPEEDS, 1, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_SPEEDS, 2, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_ACCELERATION, 0, round(homing.acceleration_m_per_s2 / step_m))
-        if self._asked_to_stop:
+        if self._stopped_meanwhile("homing the macro"):
             return Stop.OPERATOR
         self._holds_lease = True
         self.pump()

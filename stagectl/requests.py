@@ -19,6 +19,7 @@ class Mode(IntEnum):
     STOP = 3  # bring the stage to rest under the law, then take the power away
     RESET = 4  # acknowledge a fault; enables nothing
     EXIT = 5  # end the servo; a moving stage is brought to rest first
+    RELEASE = 6  # take the power away from a stage that stopped by itself; acknowledges nothing
 
 
 class Phase(IntEnum):

@@ -474,7 +474,7 @@ class Servo:
 
     def _stopped_targets(self, mode: Mode) -> tuple[cia402.State, cia402.State]:
         """Return the drive states of a stage at rest: without power where that was asked for, else held."""
-        if mode is Mode.EXIT or self.stop in _UNPOWERED_STOPS:
+        if mode in (Mode.EXIT, Mode.RELEASE) or self.stop in _UNPOWERED_STOPS:
             return cia402.State.SWITCH_ON_DISABLED, cia402.State.SWITCH_ON_DISABLED
         return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
 

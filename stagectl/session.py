@@ -368,6 +368,8 @@ class Session:
         self._demand_agreed()  # a drive that restarted sends no heartbeat for good: that says more
         if self._heartbeats.missing:
             return Stop.HEARTBEAT_LOST
+        if self._stopped_meanwhile("enabling the drives"):
+            return Stop.OPERATOR
         self._holds_lease = True
         self._reason = ""
         self._request(
@@ -376,6 +378,11 @@ class Session:
         self.pump()
         status = self._wait(lambda s: s["phase"] == Phase.TRACKING, 5.0, "enabling the drives")
         return Stop(int(status["stop"]))
+
+    def _stopped_meanwhile(self, what: str) -> bool:
+        """Hear whether somebody asked for rest while drives were read and written, which takes a second."""
+        self._progress(what, 0.0)
+        return self._asked_to_stop
 
     def armed(self, law: str | None = None) -> Outcome:
         """Enable like `enable`; FINISHED where the stage holds, else why it doesn't."""
@@ -410,6 +417,11 @@ class Session:
         if stop is Stop.OPERATOR:
             self.acknowledge()
         return stop
+
+    def release(self) -> None:
+        """Take the power away from a stage that stopped by itself; why it did is acknowledged by nobody."""
+        if self.status()["phase"] == Phase.STOPPED:
+            self._request(mode=int(Mode.RELEASE))
 
     def acknowledge(self) -> Stop:
         """Acknowledge why the servo stopped, reset drives in fault; enables nothing. Returns what stops it again.

@@ -164,7 +164,8 @@ class Desk:
         self._status, self._state = status, state
         if self._lease is not None and self._lease.released and not self.powered:
             with self._lock:
-                self._lease = None
+                if self._lease is not None and self._lease.released:  # not one that was just taken
+                    self._lease = None
 
     def next_order(self) -> Order | None:
         """Take the command that waits."""
@@ -242,7 +243,7 @@ class Desk:
             self._refuse_when_closed()
             token = secrets.token_urlsafe(24)
             now_s = self._clock_s()
-            self._lease = leases.take(self._lease, token, body.holder, body.duration_s, now_s, self.powered)
+            self._lease = leases.take(self._lease, token, body.holder, body.duration_s, now_s, self._busy)
             self._log.say("lease_taken", holder=body.holder, duration_s=body.duration_s)
             return self._taken(self._lease)
 
@@ -256,11 +257,19 @@ class Desk:
         """End a client's lease; a stage with power is brought to rest. Errors: LeaseRefused."""
         with self._lock:
             held = leases.holds(self._lease, token, self._clock_s())
-            busy = self.powered or self._waiting is not None or (self._current is not None and not self._current.over)
+            busy = self._busy
             self._lease = leases.give_back(self._lease, token, self._clock_s(), busy)
             self._log.say("lease_given_back", holder=held.holder)
             if busy:
                 self.ask_to_stop(f"{held.holder} gave the lease back")
+
+    @property
+    def _busy(self) -> bool:
+        """Whether the stage has power, or somebody's command is about to give it some.
+
+        While a run is begun on a slow disk a lease may end; the next holder's would keep alive what the last one asked.
+        """
+        return self.powered or self._waiting is not None or (self._current is not None and not self._current.over)
 
     def _taken(self, lease: Lease) -> messages.TakenLease:
         left_s = lease.left_s(self._clock_s())

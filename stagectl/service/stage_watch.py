@@ -91,6 +91,8 @@ class StageWatch(StageWorld):
         if self._state is State.ARMED:
             self._enter(Event.STOP, reason)
             self._rest(reason)
+        elif self._state is State.FAULT and self._stage is not None:
+            self._stage.release()
         self.desk.stopped()
         if self._stage is not None:
             self._stage.allow_motion()

@@ -132,6 +132,22 @@ def test_what_a_dead_service_left_is_marked_and_goes_with_the_others(tmp_path):
     assert {one.folder for one in gone} == {*states} - {own.folder}
 
 
+def test_a_run_that_could_not_be_begun_whole_is_none(tmp_path, monkeypatch):
+    session = flight(tmp_path)
+
+    def full(folder):
+        raise RecordError("no space")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(session, "_lead_to", full)
+        with pytest.raises(RecordError, match="no space"):
+            session.begin_run("motion", "arm", 0)
+    assert (session.run_folder, session.trigger) == (None, "")
+    session.begin_run("motion", "arm", 0)
+    assert session.run_folder is not None
+    session.abandon()
+
+
 @pytest.mark.parametrize("policy", ["stop", "go_on"])
 def test_a_full_disk_is_said_at_once_and_does_what_the_profile_says(tmp_path, policy):
     said = []

@@ -4,9 +4,11 @@ import time
 
 import pytest
 
+from drivers import cia402
 from sim_backend.faults import Fault
 from stagectl.errors import RequestError
 from stagectl.profile import PROFILES_FOLDER
+from stagectl.requests import Mode
 from stagectl.service import messages
 from stagectl.service.desk import Busy, Desk, Ending, Unfit
 from stagectl.service.exposition import Figures
@@ -206,6 +208,49 @@ def test_an_order_whose_lease_ended_before_it_began_is_refused_and_changes_nothi
     refused = armed.desk.command(key)
     assert (refused.state, refused.error.kind) == ("failed", "LeaseRefused")
     assert armed.do("jog", messages.JogBy(distance_m=0.001)).stop == "FINISHED"
+
+
+def drive_state(bench):
+    return cia402.state_of(int(bench.loop._stage.status()["macro_statusword"]))
+
+
+def test_nobody_takes_the_lease_of_an_order_that_waits(bench):
+    bench.take()
+    key = bench.begin("home", messages.Home())
+    bench.now_s += 100.0
+    with pytest.raises(LeaseRefused, match="still coming to rest after the last lease"):
+        bench.desk.take_lease(messages.TakeLease(holder="bert", duration_s=1.0))
+    bench.loop.step()
+    assert bench.desk.command(key).error.kind == "LeaseRefused"
+    assert bench.desk.take_lease(messages.TakeLease(holder="bert", duration_s=1.0)).holder == "bert"
+    bench.now_s += 100.0
+
+
+@pytest.mark.parametrize(("name", "body"), [("arm", messages.Arm()), ("home", messages.Home())])
+def test_a_stop_while_drives_are_read_gives_them_no_power(bench, monkeypatch, name, body):
+    bench.until(lambda: bench.status.state == "idle")
+    bench.take()
+    if not bench.status.homed:
+        assert bench.do("home", messages.Home()).stop == "FINISHED"
+    stage, asked = bench.loop._stage, []
+    request = stage._request
+    monkeypatch.setattr(stage, "_demand_agreed", lambda: bench.desk.ask_to_stop("meanwhile"))
+    monkeypatch.setattr(stage, "_request", lambda **fields: (asked.append(fields.get("mode")), request(**fields)))
+    assert bench.do(name, body).stop == "OPERATOR"
+    assert not {int(Mode.TRACK), int(Mode.HOME_DRIVE)} & set(asked)
+    assert drive_state(bench) is cia402.State.SWITCH_ON_DISABLED
+    bench.now_s += 100.0
+    bench.until(lambda: bench.status.state == "idle")
+
+
+def test_a_stop_takes_the_power_from_a_stage_with_a_fault_and_acknowledges_nothing(armed):
+    armed.inject(Fault(kind="beam_loss", axis="macro", duration_s=0.2))
+    armed.until(lambda: armed.status.state == "fault")
+    armed.until(lambda: drive_state(armed) is cia402.State.QUICK_STOP_ACTIVE)
+    number = armed.status.fault.number
+    armed.desk.ask_to_stop("hands in the machine")
+    armed.until(lambda: drive_state(armed) is cia402.State.SWITCH_ON_DISABLED)
+    assert (armed.status.state, armed.status.fault.number) == ("fault", number)
 
 
 def test_a_stop_in_the_last_moment_of_a_jog_is_a_stop(armed):
