@@ -1,13 +1,14 @@
 """Whitening: what a mass on known forces is off from its measured position, as independent numbers of unit variance.
 
-    m x'' = f + d,    d' = w (e - d),    e' = -w e + noise,    y = x + n
+    m x'' = f + d,    d' = w e,    e' = -w d - 2^(1/2) w e + noise,    y = x + n
 
 A Kalman filter of (x, v, d, e) predicts each sample from the ones before; d stands for the slow force that nobody
-models, n for the sensor. The slow force passes two low-passes: with one it would be believed to have thirty times its
-power at 20 Hz, and hide every friction there. With recorded commands as input, whatever controller ran, the
-innovations hold all that the positions say of the forces (prediction-error method, Ljung 1999, 7). The filter is
-linear: the innovations of f0 + a f1 are those of f0 plus a times those of f1 alone, which makes every effect a column
-of a regression.
+models, n for the sensor. The slow force has been through a Butterworth filter of second order, flat up to its corner:
+with one pole it would be believed to have thirty times its power at 20 Hz, and hide every friction there; with two
+poles at one place it has 1.6 times its power at standstill, and hides springs and tilts. With recorded commands as
+input, whatever controller ran, the innovations hold all that the positions say of the forces (prediction-error
+method, Ljung 1999, 7). The filter is linear: the innovations of f0 + a f1 are those of f0 plus a times those of f1
+alone, which makes every effect a column of a regression.
 
 Forces come as two numbers a sample interval: their mean, and their mean weighted towards the interval's beginning,
 (2 / h^2) integral of (h - s) f(s) ds, which is what moves the position. Pure; knows no clock.
@@ -34,20 +35,23 @@ class Noise:
 
 
 @compiled
+def _slow(turn):
+    """Return how (d, e) go on over a phase w h: (d of d, d of e, e of d, e of e)."""
+    q = turn / np.sqrt(2.0)
+    decay, c, s = np.exp(-q), np.cos(q), np.sin(q)
+    return decay * (c + s), decay * np.sqrt(2.0) * s, -decay * np.sqrt(2.0) * s, decay * (c - s)
+
+
+@compiled
 def _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
     """Return (transition, driving covariance of the slow force, covariance before the first sample), (4, 4) each."""
     h = period_s
-    turn = corner_rad_per_s * h
-    decay = np.exp(-turn)
     a = np.zeros((_STATES, _STATES))
     a[0] = np.array([1.0, h, 0.5 * h * h / mass_kg, 0.0])
     a[1] = np.array([0.0, 1.0, h / mass_kg, 0.0])
-    a[2] = np.array([0.0, 0.0, decay, decay * turn])
-    a[3] = np.array([0.0, 0.0, 0.0, decay])
-    steady = np.zeros((_STATES, _STATES))  # of the slow force: var e = 2 var d, and their covariance var d
-    steady[2, 2] = force_n * force_n
-    steady[2, 3] = steady[3, 2] = steady[2, 2]
-    steady[3, 3] = 2.0 * steady[2, 2]
+    a[2, 2], a[2, 3], a[3, 2], a[3, 3] = _slow(corner_rad_per_s * h)
+    steady = np.zeros((_STATES, _STATES))  # of the slow force: d and e are as large, and independent at one instant
+    steady[2, 2] = steady[3, 3] = force_n * force_n
     moved = a @ steady @ a.T
     drive = np.zeros((_STATES, _STATES))
     drive[2:, 2:] = steady[2:, 2:] - moved[2:, 2:]
@@ -78,13 +82,13 @@ def gains(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, 
         for i in range(_STATES):
             for j in range(_STATES):
                 total = 0.0
-                for c in range(i, _STATES):  # a is upper triangular
+                for c in range(min(i, 2), _STATES):  # a is block upper triangular
                     total += a[i, c] * p[c, j]
                 half[i, j] = total
         for i in range(_STATES):
             for j in range(_STATES):
                 total = drive[i, j]
-                for c in range(j, _STATES):
+                for c in range(min(j, 2), _STATES):
                     total += half[i, c] * a[j, c]
                 p[i, j] = total
         white = white_force_n + (loose_force_n if loose[k] else 0.0)
@@ -106,8 +110,7 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
     v = 0.0
     d = 0.0
     e = 0.0
-    turn = corner_rad_per_s * h
-    decay = np.exp(-turn)
+    dd, de, ed, ee = _slow(corner_rad_per_s * h)
     for k in range(n):
         z = position_m[k] - x
         if gain[k, 0] != 0.0:
@@ -118,8 +121,7 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
         e += gain[k, 3] * z
         x += v * h + 0.5 * h * h * (early_n[k] + d) / mass_kg
         v += h * (mean_n[k] + d) / mass_kg
-        d = decay * (d + turn * e)
-        e *= decay
+        d, e = dd * d + de * e, ed * d + ee * e
     return out
 
 

@@ -6,11 +6,15 @@ import numpy as np
 
 from stagectl.gap.competition import Competition
 from stagectl.gap.normal_equations import Group, solve
-from stagectl.gap.selection import CURVE_GAIN, MATERIAL_RATIO
+from stagectl.gap.selection import ALIAS_GAIN, CURVE_GAIN, MATERIAL_RATIO, Judge
 
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
 _CURVE_SHARE = MATERIAL_RATIO  # more than what an inexact law leaves
+_CROWD_COUNT = 3
+"""So many names on one body that a single curve does as well as are one effect that has no name: a spring with a dead
+zone came out as a spring, a cable that slips, a cogging as long as the travel and an offset, 4 squares of 107 000
+better than a curve over position."""
 
 
 def excess(search: Competition, chosen: list[Group]) -> float:
@@ -30,7 +34,12 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
     Names are worth stating only where with them nothing is left: a law of the library that fits an unknown force half
     is a wrong name.
     """
-    judge, evidence = search.judge, search.evidence
+    judge = search.judge
+    crowd, instead = one_curve_for_many(judge, chosen)
+    if instead is not None:
+        beside = [group for group in chosen if not any(group is other for other in crowd)]
+        gained = judge.gain([*beside, instead]) - judge.gain(beside)
+        return _curve_found(search, beside, instead, excess(search, beside), before_excess, gained)
     left, first = excess(search, chosen), before_excess
     noise = _noise(search)
     best, gained = None, 0.0
@@ -43,10 +52,31 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
     material = best is not None and gained > max(CURVE_GAIN * judge.threshold, _CURVE_SHARE * max(first, 0.0))
     if not left > floor and not material:
         return None
+    return _curve_found(search, chosen, best, left, first, gained)
+
+
+def one_curve_for_many(judge: Judge, chosen: list[Group]) -> tuple[list[Group], Group | None]:
+    """Return names on one body and the curve that does as well as all of them; none where there is no such body."""
+    for place in sorted({group.key[1] for group in chosen}):
+        crowd = [group for group in chosen if group.key[1] == place]
+        if len(crowd) < _CROWD_COUNT:
+            continue
+        beside = [group for group in chosen if group.key[1] != place]
+        curves = [curve for curve in judge.curves if curve.key[1] == place]
+        best = max(curves, key=lambda curve: judge.gain([*beside, curve]), default=None)
+        if best is not None and judge.gain([*beside, best]) > judge.gain(chosen) - ALIAS_GAIN:
+            return crowd, best
+    return [], None
+
+
+def _curve_found(
+    search: Competition, beside: list[Group], curve: Group | None, left: float, first: float, gained: float
+) -> dict[str, Any]:
+    """Return what is left, of how much, and the curve that goes furthest, with its gain."""
     found: dict[str, Any] = {"left": left, "before": first, "gain": gained}
-    if best is not None:
-        term = evidence.terms[best.columns[0]]
-        values, sds = solve([*judge.base, *chosen, best], evidence.sums).of(best)
+    if curve is not None:
+        term = search.evidence.terms[curve.columns[0]]
+        values, sds = solve([*search.judge.base, *beside, curve], search.evidence.sums).of(curve)
         found |= {
             "over": term.name.removeprefix("curve over "),
             "acts_on": term.acts_on,
