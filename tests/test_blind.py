@@ -471,6 +471,20 @@ def test_no_size_tells_a_law_from_itself(touching, monkeypatch, name, acts_on, v
     assert evidence.distances(signal)[name, acts_on] < 0.05 * whole
 
 
+def test_a_wrong_force_constant_is_told_from_a_wrong_mass_by_what_else_acts(monkeypatch):
+    """On one axis F = m a + b v: (1 + e) F is a mass as wrong, but for e b v, which a friction as wrong makes up for."""
+    case = generate.draw(2177, "parameter", 6.0)
+    (key, sds), b = next(iter(case.parameter_errors.items())), "macro_damping_n_s_per_m"
+    assert key == ("force_constant_error", "macro_actuator")
+    monkeypatch.setattr(detection.laws, "LIBRARY", [])
+    _, wrong = detection.judged(case)
+    constant = case.base[B["macro_force_constant_n_per_a"]]
+    ratio = abs(sds) * case.uncertainty["macro_force_constant_n_per_a"] / constant
+    assert wrong[key].d_prime > 10.0
+    at_most = ratio * case.base[B[b]] / case.uncertainty[b]
+    assert wrong[key].nearest["mass_error", "macro_force"] < at_most + 0.2
+
+
 def test_a_whitened_null_is_white(touching):
     """The balance of a null set, whitened by the stated spectra, has unit variance but for the taper's share."""
     runs = draw.simulate(touching, [])
