@@ -472,7 +472,7 @@ def test_no_size_tells_a_law_from_itself(touching, monkeypatch, name, acts_on, v
 
 
 def test_a_wrong_force_constant_is_told_from_a_wrong_mass_by_what_else_acts(monkeypatch):
-    """On one axis F = m a + b v: (1 + e) F is a mass as wrong, but for e b v, which a friction as wrong makes up for."""
+    """On one axis F = m a + b v: (1 + e) F is a mass as wrong, but for e b v, which friction as wrong is."""
     case = generate.draw(2177, "parameter", 6.0)
     (key, sds), b = next(iter(case.parameter_errors.items())), "macro_damping_n_s_per_m"
     assert key == ("force_constant_error", "macro_actuator")
