@@ -471,6 +471,14 @@ def test_no_size_tells_a_law_from_itself(touching, monkeypatch, name, acts_on, v
     assert evidence.distances(signal)[name, acts_on] < 0.05 * whole
 
 
+def test_a_lag_is_told_from_the_delay_that_is_nearest(monkeypatch):
+    """Of 78 us, in contact: a delay of 50 us asks for 56, and 200 us for 63."""
+    case = generate.draw(2238, None, 20.0)
+    evidence = detection.Evidence(case, case.runs, 150.0)
+    monkeypatch.setattr(detection.laws, "LIBRARY", [laws.BY_NAME["sensor_delay"]])
+    assert evidence.distances(evidence.effect_column(0))["sensor_delay", "end_sensor"] < 1.0
+
+
 def test_a_wrong_force_constant_is_told_from_a_wrong_mass_by_what_else_acts(monkeypatch):
     """On one axis F = m a + b v: (1 + e) F is a mass as wrong, but for e b v, which friction as wrong is."""
     case = generate.draw(2177, "parameter", 6.0)

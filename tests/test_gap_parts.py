@@ -9,12 +9,14 @@ import pytest
 from scipy import signal
 
 from stagectl.errors import RecordError, RequestError
-from stagectl.gap import innovations
+from stagectl.gap import balance, innovations
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.findings_file import read_findings, write_findings
+from stagectl.gap.forces import Forces
 from stagectl.gap.innovations import moments
 from stagectl.gap.left_over import one_curve_for_many
 from stagectl.gap.log import Log, log_of_rows
+from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
 from stagectl.gap.selection import Judge
 from stagectl.gap.workflow import find
@@ -363,6 +365,18 @@ def test_hidden_dry_friction_is_named_and_nothing_where_nothing_is_missing(frict
     sd = findings.refitted_sds["macro_mass_kg"]
     assert 0.0 < sd < 0.01
     assert findings.refitted["macro_mass_kg"] == pytest.approx(-0.005, abs=3.0 * sd)
+
+
+def test_a_wrong_name_makes_no_noise_that_hides_what_it_leaves():
+    """What is thought to act and doesn't reddens innovations like a force noise; there is none that wasn't before."""
+    recordings = [balance.recording_of(_axis_log("run 1", 1.0, 1), _believed())]
+    before = noise_of(recordings)
+
+    def wrong(recording):
+        return Forces(macro_n=30.0 * np.sign(np.sin(400.0 * recording.macro.position_m * 1e3)))
+
+    assert noise_of(recordings, wrong)["macro"].white_force_n > before["macro"].white_force_n
+    assert noise_of(recordings, wrong, before) == before
 
 
 def test_same_input_same_answer():

@@ -188,7 +188,7 @@ def _under(
         refused=refused,
         moved=motion.moved,
         kept=motion.kept,
-        noise=noise_of(motion.recordings, motion.explained),
+        noise=noise_of(motion.recordings, motion.explained, first.noise),
         crew=crew,
     )
     search.judge.threshold, search.judge.trace = first.judge.threshold, first.judge.trace
