@@ -416,6 +416,7 @@ class RealtimeBackend:
         cpus = sorted(os.sched_getaffinity(0))
         self._servo().tell(
             {
+                "supervisor_pid": os.getpid(),
                 "profile": profile.effective(),
                 "mappings": {axis: describe_mapping(mapping) for axis, mapping in mappings.items()},
                 "interface": self._interface,

@@ -193,6 +193,10 @@ class Servo:
         words = [getattr(seen, f"{axis}_statusword") for axis in self._node_ids]
         return not any(cia402.state_of(word) in _POWERED for word in words)
 
+    def leave(self) -> None:
+        """Go on as if the supervisor, who is gone, had asked for the end: a stage at rest loses its power."""
+        self._asked.mode = int(Mode.EXIT)
+
     # ---- one cycle ---------------------------------------------------------------------------------------------
 
     def cycle(self) -> None:

@@ -12,6 +12,7 @@ import pytest
 from drivers import cia402
 from drivers.wire import Inbox
 from sim_backend.faults import Fault
+from stagectl import servo_process
 from stagectl.backend import BatchBackend
 from stagectl.errors import DriveError, LinkError, RecordError, RequestError
 from stagectl.outcome import BacklashEstimate
@@ -644,6 +645,20 @@ def test_a_stage_whose_processes_were_killed_is_armed_again(tmp_path, oled_profi
         home_by_truth(stage, left.plant)
         assert stage.enable() is Stop.NONE
     assert replay(tmp_path / "run").exact
+
+
+def test_a_servo_without_a_supervisor_brings_the_stage_to_rest_and_takes_the_power_away(
+    tmp_path, oled_profile, oled_machine
+):
+    """Nobody is there who could: whoever comes next may be a person with a hand at the stage."""
+    left = killed_at_speed(tmp_path / "killed", oled_profile, oled_machine, 0.0)
+    assert left.drive_states == ("OPERATION_ENABLED", "OPERATION_ENABLED")
+    servo = left.backend.servo
+    nobodys_pid = 0
+    assert servo_process._run(servo, nobodys_pid)
+    assert servo.stop is Stop.SUPERVISOR_SILENT
+    assert left.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+    assert abs(left.plant["macro_velocity_m_per_s"]) < REST_M_PER_S
 
 
 def test_a_stage_that_is_still_braking_is_not_let_go(tmp_path, oled_profile, oled_machine):
