@@ -36,6 +36,7 @@ _STEP_S = 0.02
 _SENSOR_TIMEOUT_S = 5.0
 _RESET_TIMEOUT_S = 2.0
 _NEWS_KEPT_COUNT = 100
+_STALL_S = 1.5  # without a cycle: three times what the servo grants this side
 _FAULTS = (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE)
 
 _WITH_POWER = (int(Mode.TRACK), int(Mode.HOME_DRIVE))
@@ -82,6 +83,7 @@ class Session:
         self._holds_lease = False
         self._watches = False
         self._asked_to_stop = False
+        self._rows_seen, self._stalled_s = -1, 0.0
         self._heartbeats = Heartbeats(profile.trip.heartbeat_s)
         axes = ((axis, profile.axis(axis).temperature) for axis in profile.axes)
         tables = {axis: table for axis, table in axes if table is not None}
@@ -150,6 +152,7 @@ class Session:
         """Let time pass: renew counter and lease, drain the ring, watch the drives; returns the newest state.
 
         What goes wrong on this side (full disk, dead receiver) first brings the stage to rest, and is raised then.
+        TimingError where the servo does no cycle any more: it can bring nothing to rest.
         """
         link = self.link
         self._counter += 1
@@ -167,10 +170,18 @@ class Session:
         if self._watches:
             self._watch_drives()
         status = self.status()
+        self._demand_cycles(int(status["rows"]), duration_s)
         if self._trouble is not None and status["phase"] in RESTING:
             trouble, self._trouble = self._trouble, None
             raise trouble
         return status
+
+    def _demand_cycles(self, rows_count: int, duration_s: float) -> None:
+        """Notice a servo that hangs. What counts is the time asked to pass: a host that slept held up both sides."""
+        self._stalled_s = self._stalled_s + duration_s if rows_count == self._rows_seen else 0.0
+        self._rows_seen = rows_count
+        if self._stalled_s > _STALL_S:
+            raise TimingError(f"the servo has done no cycle for {_STALL_S:g} s; it hangs, or the host does")
 
     def _distress(self, stop: Stop, reason: str, trouble: StagectlError | None = None) -> None:
         """Have the servo bring the stage to rest under its law; `trouble` is raised when it has."""
@@ -312,6 +323,8 @@ class Session:
         try:
             status = self._wait(lambda s: bool(s["sensor_ready"]), _SENSOR_TIMEOUT_S, "waiting for the interferometer")
         except TimingError as error:
+            if self._stalled_s > _STALL_S:
+                raise
             raise LinkError(self._sensor_text()) from error
         if not status["sensor_ready"]:
             raise LinkError(stop_sentence(Stop(int(status["stop"])), self.detail))

@@ -14,7 +14,7 @@ from drivers.wire import Inbox
 from sim_backend.faults import Fault
 from stagectl import servo_process
 from stagectl.backend import BatchBackend
-from stagectl.errors import DriveError, LinkError, RecordError, RequestError
+from stagectl.errors import DriveError, LinkError, RecordError, RequestError, TimingError
 from stagectl.outcome import BacklashEstimate
 from stagectl.profile import Identity
 from stagectl.record import read_run
@@ -610,6 +610,26 @@ def test_a_profile_whose_motion_the_cap_forbids_is_not_armed(tmp_path, oled_prof
     )
     with pytest.raises(DriveError, match=pattern):
         arm(oled_profile, BatchBackend(without_deadline(oled_machine), seed=SEED), tmp_path / "run")
+
+
+def test_a_servo_that_hangs_in_a_jog_is_noticed(tmp_path, oled_profile, oled_machine, monkeypatch):
+    """A jog has no end of its own, and what the servo said last is a stage that moves; the drives have stopped it."""
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    wire, asked = one.backend.wire, []
+
+    def wanted():
+        asked.append(wire.t_ns)
+        assert len(asked) < 150
+        if len(asked) == 50:
+            monkeypatch.setattr(one.backend.servo, "cycle", lambda: wire.advance_to(wire.t_ns + 1_000_000))
+        return 0.1
+
+    with pytest.raises(TimingError, match="no cycle for 1.5 s"), one:
+        assert one.arm() is Stop.NONE
+        with pytest.raises(TimingError, match="no cycle for 1.5 s"):
+            one.stage.jog(wanted)
+        assert abs(one.plant["macro_velocity_m_per_s"]) < REST_M_PER_S
+    assert read_run(tmp_path / "run").rows.size == one.backend.servo.ring.written_count
 
 
 def killed_at_speed(folder, profile, machine, wait_s: float) -> Stage:
