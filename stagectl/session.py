@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers import cia402
 from drivers.agreed import Agreed, changed, read_agreed
-from drivers.arming import DriveMapping, DriveSettings, configure
+from drivers.arming import MODES, DriveMapping, DriveSettings, configure
 from drivers.canopen_master import Master
 from stagectl.backend import Backend, ServoLink
 from stagectl.drive_settings import drive_settings
@@ -35,6 +35,7 @@ from stagectl.undisturbed import undisturbed
 _STEP_S = 0.02
 _SENSOR_TIMEOUT_S = 5.0
 _RESET_TIMEOUT_S = 2.0
+_MODE_TIMEOUT_S = 0.5
 _NEWS_KEPT_COUNT = 100
 _STALL_S = 1.5  # without a cycle: three times what the servo grants this side
 _FAULTS = (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE)
@@ -92,6 +93,7 @@ class Session:
         self._reason = ""  # why this side asked the servo to stop
         self._trouble: StagectlError | None = None  # raised as soon as the stage rests
         self.mappings: dict[str, DriveMapping] = {}
+        self._modes: dict[AxisName, int] = {}
         self._agreed: dict[int, Agreed] = {}
         self.remarks: list[str] = []
         """What the operator should know of this arming, in words."""
@@ -266,6 +268,7 @@ class Session:
         settings = drive_settings(self.profile, backend.vendor_id)
         found = configure(master, list(settings.values()), self._remark)
         self.mappings = dict(zip(settings, found, strict=True))
+        self._modes = {axis: MODES[drive.mode] for axis, drive in settings.items()}
         self._agreed = {drive.node_id: read_agreed(master, drive) for drive in settings.values()}
         # What a drive was capped to is what laws, guard, plans and replay go by from here on.
         profile = self.profile = self.profile.with_force_limits(self._force_limits_n(settings))
@@ -308,6 +311,22 @@ class Session:
         text = self.drives_changed()
         if text:
             raise DriveError(f"{text}; connect the stage anew")
+
+    def _demand_mode(self, axis: AxisName, mode: int) -> None:
+        """Give no drive power in another mode of operation than it is commanded in. Errors: LinkError, DriveError.
+
+        One drive takes a mode at once, another a little after it was written.
+        """
+        node_id = self.profile.axis(axis).node_id
+        give_up_t_ns = self.link.now_t_ns() + round(_MODE_TIMEOUT_S * 1e9)
+        while (shown := self.master.read(node_id, cia402.MODES_OF_OPERATION_DISPLAY)) != mode:
+            if self.link.now_t_ns() > give_up_t_ns:
+                raise DriveError(
+                    f"{axis} (node {node_id}): mode of operation 0x6061 is {shown}, wanted {mode}, for "
+                    f"{_MODE_TIMEOUT_S:g} s: another master wrote 0x6060, or the drive does not take it; "
+                    "connect the stage anew"
+                )
+            self.pump()
 
     def _force_limits_n(self, settings: dict[AxisName, DriveSettings]) -> dict[AxisName, float]:
         """Return the limits of the drives that arming capped below what the profile asked for."""
@@ -381,6 +400,8 @@ class Session:
         self._demand_agreed()  # a drive that restarted sends no heartbeat for good: that says more
         if self._heartbeats.missing:
             return Stop.HEARTBEAT_LOST
+        for axis, mode in self._modes.items():
+            self._demand_mode(axis, mode)
         if self._stopped_meanwhile("enabling the drives"):
             return Stop.OPERATOR
         self._holds_lease = True

@@ -624,11 +624,13 @@ def test_a_servo_that_hangs_in_a_jog_is_noticed(tmp_path, oled_profile, oled_mac
             monkeypatch.setattr(one.backend.servo, "cycle", lambda: wire.advance_to(wire.t_ns + 1_000_000))
         return 0.1
 
-    with pytest.raises(TimingError, match=r"no cycle for 1\.5 s"), one:
-        assert one.arm() is Stop.NONE
-        with pytest.raises(TimingError, match=r"no cycle for 1\.5 s"):
-            one.stage.jog(wanted)
-        assert abs(one.plant["macro_velocity_m_per_s"]) < REST_M_PER_S
+    one.__enter__()
+    assert one.arm() is Stop.NONE
+    with pytest.raises(TimingError, match=r"no cycle for 1\.5 s"):
+        one.stage.jog(wanted)
+    assert abs(one.plant["macro_velocity_m_per_s"]) < REST_M_PER_S
+    with pytest.raises(TimingError, match=r"no cycle for 1\.5 s"):
+        one.stage.close()
     assert read_run(tmp_path / "run").rows.size == one.backend.servo.ring.written_count
 
 
