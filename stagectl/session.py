@@ -94,6 +94,7 @@ class Session:
         self._trouble: StagectlError | None = None  # raised as soon as the stage rests
         self.mappings: dict[str, DriveMapping] = {}
         self._modes: dict[AxisName, int] = {}
+        self._written_modes: dict[AxisName, int] = {}  # since arming
         self._agreed: dict[int, Agreed] = {}
         self.remarks: list[str] = []
         """What the operator should know of this arming, in words."""
@@ -312,6 +313,10 @@ class Session:
         if text:
             raise DriveError(f"{text}; connect the stage anew")
 
+    def _write_mode(self, axis: AxisName, mode: int) -> None:
+        self.master.write(self.profile.axis(axis).node_id, cia402.MODES_OF_OPERATION, 0, mode)
+        self._written_modes[axis] = mode
+
     def _demand_mode(self, axis: AxisName, mode: int) -> None:
         """Give no drive power in another mode of operation than it is commanded in. Errors: LinkError, DriveError.
 
@@ -400,12 +405,16 @@ class Session:
         self._demand_agreed()  # a drive that restarted sends no heartbeat for good: that says more
         if self._heartbeats.missing:
             return Stop.HEARTBEAT_LOST
-        for axis, mode in self._modes.items():
-            self._demand_mode(axis, mode)
+        if self.status()["phase"] != Phase.STOPPED:  # else nothing is enabled before somebody acknowledges
+            for axis, mode in self._modes.items():
+                if self._written_modes.get(axis, mode) != mode:  # a homing's own
+                    self._write_mode(axis, mode)
+                self._demand_mode(axis, mode)
         if self._stopped_meanwhile("enabling the drives"):
             return Stop.OPERATOR
         self._holds_lease = True
         self._reason = ""
+        self.pump()
         self._request(
             mode=int(Mode.TRACK), stop=int(Stop.NONE), law_number=LAW_NAMES.index(law or self.profile.control.law)
         )

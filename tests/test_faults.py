@@ -19,7 +19,7 @@ from stagectl.outcome import BacklashEstimate
 from stagectl.profile import Identity
 from stagectl.record import read_run
 from stagectl.replay import replay
-from stagectl.requests import Phase
+from stagectl.requests import Mode, Phase
 from stagectl.row import SENSOR_BYTES_COUNT
 from stagectl.signals import SETPOINT, STOP_TEXT, Stop
 from stagectl.supervisor import Supervisor
@@ -610,6 +610,22 @@ def test_a_profile_whose_motion_the_cap_forbids_is_not_armed(tmp_path, oled_prof
     )
     with pytest.raises(DriveError, match=pattern):
         arm(oled_profile, BatchBackend(without_deadline(oled_machine), seed=SEED), tmp_path / "run")
+
+
+def test_no_drive_gets_power_without_a_lease(tmp_path, oled_profile, oled_machine):
+    """Not even for the cycles in which it is enabled."""
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        one.stage._request(mode=int(Mode.TRACK))
+        one.stage.pump(0.5)
+        assert Stop(int(one.stage.status()["stop"])) is Stop.LEASE
+        assert one.stage.detail.startswith("there was none when the drives were to get power")
+        assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+        one.stage.acknowledge()
+        assert one.arm() is Stop.NONE
+    phases = read_run(tmp_path / "run").rows["run_phase"]
+    assert phases[np.flatnonzero(phases == Phase.ENABLING)[0] - 1] == Phase.IDLE
+    assert Phase.STOPPED in phases[: np.flatnonzero(phases == Phase.ENABLING)[0]]
 
 
 def test_a_servo_that_hangs_in_a_jog_is_noticed(tmp_path, oled_profile, oled_machine, monkeypatch):
