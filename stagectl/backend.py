@@ -533,7 +533,8 @@ class RigBackend(RealtimeBackend):
             self._servo()  # begun now, for both to compile side by side
             self._rig.hear(_WARM_TIMEOUT_S)
         except BaseException:
-            self.close()
+            with undisturbed():
+                self.close()
             raise
         with_what = {
             RIG: "",

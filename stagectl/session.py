@@ -103,7 +103,8 @@ class Session:
         try:
             self.connect()
         except BaseException as error:
-            self._close(error)
+            with undisturbed():  # a signal that raises would leave servo or rig behind
+                self._close(error)
             raise
         return self
 
