@@ -53,6 +53,7 @@ _NEEDED = (
     (cia402.STATUSWORD, (0,)),
     (cia402.QUICK_STOP_OPTION_CODE, (0,)),
     (cia402.MODES_OF_OPERATION, (0,)),
+    (cia402.MODES_OF_OPERATION_DISPLAY, (0,)),
     (cia402.MAX_TORQUE, (0,)),
     (cia402.MOTOR_RATED_TORQUE, (0,)),
     (cia402.QUICK_STOP_DECELERATION, (0,)),
@@ -64,7 +65,7 @@ _NEEDED_TO_HOME = (
     (cia402.HOMING_ACCELERATION, (0,)),
 )
 
-_MODES = {"torque": cia402.MODE_CST, "position": cia402.MODE_CSP}
+MODES = {"torque": cia402.MODE_CST, "position": cia402.MODE_CSP}
 _ENERGISED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia402.State.FAULT_REACTION_ACTIVE)
 _IDENTITY_NAMES = ("vendor id", "product code", "revision number", "serial number")  # 0x1018:01 .. :04
 _REST_M_PER_S = 1e-3  # slower than this is standstill
@@ -213,8 +214,8 @@ def _check_settings(drives: list[DriveSettings]) -> None:
             raise ProfileError(f"node {drive.node_id}: heartbeat of {drive.heartbeat_ms} ms is outside 1 .. 65535")
         if not 1 <= drive.rpdo_deadline_ms <= 0xFFFF:
             raise ProfileError(f"node {drive.node_id}: RPDO deadline {drive.rpdo_deadline_ms} ms is outside 1 .. 65535")
-        if drive.mode not in _MODES:
-            raise ProfileError(f"node {drive.node_id}: mode = {drive.mode!r} is not one of {', '.join(_MODES)}")
+        if drive.mode not in MODES:
+            raise ProfileError(f"node {drive.node_id}: mode = {drive.mode!r} is not one of {', '.join(MODES)}")
 
 
 def _check_identity(master: "Master", drive: DriveSettings) -> None:
@@ -286,7 +287,7 @@ def _check_mode_supported(master: "Master", drive: DriveSettings) -> None:
     if not master.has(drive.node_id, cia402.SUPPORTED_DRIVE_MODES):
         return
     supported = master.read(drive.node_id, cia402.SUPPORTED_DRIVE_MODES, 0)
-    mode = _MODES[drive.mode]
+    mode = MODES[drive.mode]
     if not supported >> mode - 1 & 1:
         raise DriveError(
             f"node {drive.node_id}: 0x6502:00 supported modes: wanted bit {mode - 1} ({drive.mode}), "
@@ -344,7 +345,7 @@ def _configure_drive(master: "Master", drive: DriveSettings, remark: Callable[[s
     store(cia402.INTERPOLATION_TIME_PERIOD, 2, period_index, "interpolation time index", remedy)
     store(cia402.COB_ID_EMCY, 0, EMERGENCY_ID + node_id, "COB-ID EMCY", "correct the drive's COB-ID")
     remedy = "choose another mode in the profile, or another drive"
-    store(cia402.MODES_OF_OPERATION, 0, _MODES[drive.mode], "mode of operation", remedy)
+    store(cia402.MODES_OF_OPERATION, 0, MODES[drive.mode], "mode of operation", remedy)
 
     _silence_other_pdos(master, store)
     _watch_the_servo(store, drive, remark)

@@ -416,6 +416,7 @@ class RealtimeBackend:
         cpus = sorted(os.sched_getaffinity(0))
         self._servo().tell(
             {
+                "supervisor_pid": os.getpid(),
                 "profile": profile.effective(),
                 "mappings": {axis: describe_mapping(mapping) for axis, mapping in mappings.items()},
                 "interface": self._interface,
@@ -532,7 +533,8 @@ class RigBackend(RealtimeBackend):
             self._servo()  # begun now, for both to compile side by side
             self._rig.hear(_WARM_TIMEOUT_S)
         except BaseException:
-            self.close()
+            with undisturbed():
+                self.close()
             raise
         with_what = {
             RIG: "",

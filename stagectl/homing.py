@@ -158,11 +158,12 @@ class Homing(StreamMotion):
         self.disarm()
         self._demand_agreed()
         master = self.master
-        master.write(node, cia402.MODES_OF_OPERATION, 0, cia402.MODE_HOMING)
+        self._write_mode("macro", cia402.MODE_HOMING)
         master.write(node, cia402.HOMING_METHOD, 0, method)
         master.write(node, cia402.HOMING_SPEEDS, 1, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_SPEEDS, 2, round(homing.speed_m_per_s / step_m))
         master.write(node, cia402.HOMING_ACCELERATION, 0, round(homing.acceleration_m_per_s2 / step_m))
+        self._demand_mode("macro", cia402.MODE_HOMING)
         if self._stopped_meanwhile("homing the macro"):
             return Stop.OPERATOR
         self._holds_lease = True
@@ -173,12 +174,10 @@ class Homing(StreamMotion):
         return Stop(int(status["stop"]))
 
     def _leave_homing(self) -> None:
-        """Wait until the macro's drive has let go, and give it back the mode that the servo works in."""
+        """Wait until the macro's drive has let go; enabling gives it back the mode that the servo works in."""
         self._wait(
             lambda s: cia402.state_of(int(s["macro_statusword"])) is cia402.State.SWITCH_ON_DISABLED, 5.0, "resting"
         )
-        mode = cia402.MODE_CSP if self.profile.macro.mode == "position" else cia402.MODE_CST
-        self.master.write(self.profile.macro.node_id, cia402.MODES_OF_OPERATION, 0, mode)
 
     def take_backlash(self, estimate: BacklashEstimate) -> None:
         """Believe an identified backlash; the end's zero moves so that the gap's centre is where the profile has it.

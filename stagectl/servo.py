@@ -193,6 +193,10 @@ class Servo:
         words = [getattr(seen, f"{axis}_statusword") for axis in self._node_ids]
         return not any(cia402.state_of(word) in _POWERED for word in words)
 
+    def leave(self) -> None:
+        """Go on as if the supervisor, who is gone, had asked for the end: a stage at rest loses its power."""
+        self._asked.mode = int(Mode.EXIT)
+
     # ---- one cycle ---------------------------------------------------------------------------------------------
 
     def cycle(self) -> None:
@@ -380,6 +384,8 @@ class Servo:
             return Stop.DIGITAL_INPUT, self._detail(Stop.DIGITAL_INPUT)
         if mode is Mode.TRACK and seen.reference_lost != 0:
             return Stop.REFERENCE_LOST, self.decoder.reference_text
+        if seen.lease_left_ns <= 0:
+            return Stop.LEASE, "there was none when the drives were to get power; renew it as long as the stage moves"
         return Stop.NONE, ""
 
     def _advance_phase(self, t_ns: int) -> tuple[cia402.State, cia402.State]:

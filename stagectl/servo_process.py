@@ -189,7 +189,7 @@ def _serve(config: dict[str, Any]) -> int:
     _say({"running": True, "refused": refused, "warnings": port.warnings})
     while port.read():  # lines that waited are old: their arrival says nothing
         pass
-    orphaned = _run(servo)
+    orphaned = _run(servo, config["supervisor_pid"])
     transport.close()
     ring.close()
     status.close()
@@ -201,19 +201,20 @@ def _serve(config: dict[str, Any]) -> int:
     return 0
 
 
-def _run(servo: Servo) -> bool:
+def _run(servo: Servo, supervisor_pid: int) -> bool:
     """Cycle until asked to exit, or until the supervisor has been gone for good; True for the latter."""
-    parent_pid = os.getppid()
-    leaving = 0
+    orphaned, leaving = False, 0
     while True:
         servo.cycle()
-        resting = servo.phase in RESTING
-        if resting and servo.mode is Mode.EXIT:
+        if servo.phase not in RESTING:
+            continue
+        if servo.mode is Mode.EXIT:
             leaving += 1
             if leaving > 1 and (servo.released or leaving > RELEASE_CYCLES):
-                return False
-        if resting and servo.supervisor_silence_s > _ORPHAN_S and os.getppid() != parent_pid:
-            return True
+                return orphaned
+        elif servo.supervisor_silence_s > _ORPHAN_S and os.getppid() != supervisor_pid:
+            orphaned = True
+            servo.leave()
 
 
 def main() -> int:

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers import cia402
 from drivers.agreed import Agreed, changed, read_agreed
-from drivers.arming import DriveMapping, DriveSettings, configure
+from drivers.arming import MODES, DriveMapping, DriveSettings, configure
 from drivers.canopen_master import Master
 from stagectl.backend import Backend, ServoLink
 from stagectl.drive_settings import drive_settings
@@ -35,7 +35,9 @@ from stagectl.undisturbed import undisturbed
 _STEP_S = 0.02
 _SENSOR_TIMEOUT_S = 5.0
 _RESET_TIMEOUT_S = 2.0
+_MODE_TIMEOUT_S = 0.5
 _NEWS_KEPT_COUNT = 100
+_STALL_S = 1.5  # without a cycle: three times what the servo grants this side
 _FAULTS = (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE)
 
 _WITH_POWER = (int(Mode.TRACK), int(Mode.HOME_DRIVE))
@@ -82,6 +84,7 @@ class Session:
         self._holds_lease = False
         self._watches = False
         self._asked_to_stop = False
+        self._rows_seen, self._stalled_s = -1, 0.0
         self._heartbeats = Heartbeats(profile.trip.heartbeat_s)
         axes = ((axis, profile.axis(axis).temperature) for axis in profile.axes)
         tables = {axis: table for axis, table in axes if table is not None}
@@ -90,6 +93,8 @@ class Session:
         self._reason = ""  # why this side asked the servo to stop
         self._trouble: StagectlError | None = None  # raised as soon as the stage rests
         self.mappings: dict[str, DriveMapping] = {}
+        self._modes: dict[AxisName, int] = {}
+        self._written_modes: dict[AxisName, int] = {}  # since arming
         self._agreed: dict[int, Agreed] = {}
         self.remarks: list[str] = []
         """What the operator should know of this arming, in words."""
@@ -98,7 +103,8 @@ class Session:
         try:
             self.connect()
         except BaseException as error:
-            self._close(error)
+            with undisturbed():  # a signal that raises would leave servo or rig behind
+                self._close(error)
             raise
         return self
 
@@ -150,6 +156,7 @@ class Session:
         """Let time pass: renew counter and lease, drain the ring, watch the drives; returns the newest state.
 
         What goes wrong on this side (full disk, dead receiver) first brings the stage to rest, and is raised then.
+        TimingError where the servo does no cycle any more: it can bring nothing to rest.
         """
         link = self.link
         self._counter += 1
@@ -167,10 +174,18 @@ class Session:
         if self._watches:
             self._watch_drives()
         status = self.status()
+        self._demand_cycles(int(status["rows"]), duration_s)
         if self._trouble is not None and status["phase"] in RESTING:
             trouble, self._trouble = self._trouble, None
             raise trouble
         return status
+
+    def _demand_cycles(self, rows_count: int, duration_s: float) -> None:
+        """Notice a servo that hangs. What counts is the time asked to pass: a host that slept held up both sides."""
+        self._stalled_s = self._stalled_s + duration_s if rows_count == self._rows_seen else 0.0
+        self._rows_seen = rows_count
+        if self._stalled_s > _STALL_S:
+            raise TimingError(f"the servo has done no cycle for {_STALL_S:g} s; it hangs, or the host does")
 
     def _distress(self, stop: Stop, reason: str, trouble: StagectlError | None = None) -> None:
         """Have the servo bring the stage to rest under its law; `trouble` is raised when it has."""
@@ -255,6 +270,7 @@ class Session:
         settings = drive_settings(self.profile, backend.vendor_id)
         found = configure(master, list(settings.values()), self._remark)
         self.mappings = dict(zip(settings, found, strict=True))
+        self._modes = {axis: MODES[drive.mode] for axis, drive in settings.items()}
         self._agreed = {drive.node_id: read_agreed(master, drive) for drive in settings.values()}
         # What a drive was capped to is what laws, guard, plans and replay go by from here on.
         profile = self.profile = self.profile.with_force_limits(self._force_limits_n(settings))
@@ -298,6 +314,26 @@ class Session:
         if text:
             raise DriveError(f"{text}; connect the stage anew")
 
+    def _write_mode(self, axis: AxisName, mode: int) -> None:
+        self.master.write(self.profile.axis(axis).node_id, cia402.MODES_OF_OPERATION, 0, mode)
+        self._written_modes[axis] = mode
+
+    def _demand_mode(self, axis: AxisName, mode: int) -> None:
+        """Give no drive power in another mode of operation than it is commanded in. Errors: LinkError, DriveError.
+
+        One drive takes a mode at once, another a little after it was written.
+        """
+        node_id = self.profile.axis(axis).node_id
+        give_up_t_ns = self.link.now_t_ns() + round(_MODE_TIMEOUT_S * 1e9)
+        while (shown := self.master.read(node_id, cia402.MODES_OF_OPERATION_DISPLAY)) != mode:
+            if self.link.now_t_ns() > give_up_t_ns:
+                raise DriveError(
+                    f"{axis} (node {node_id}): mode of operation 0x6061 is {shown}, wanted {mode}, for "
+                    f"{_MODE_TIMEOUT_S:g} s: another master wrote 0x6060, or the drive does not take it; "
+                    "connect the stage anew"
+                )
+            self.pump()
+
     def _force_limits_n(self, settings: dict[AxisName, DriveSettings]) -> dict[AxisName, float]:
         """Return the limits of the drives that arming capped below what the profile asked for."""
         limits_n: dict[AxisName, float] = {}
@@ -312,6 +348,8 @@ class Session:
         try:
             status = self._wait(lambda s: bool(s["sensor_ready"]), _SENSOR_TIMEOUT_S, "waiting for the interferometer")
         except TimingError as error:
+            if self._stalled_s > _STALL_S:
+                raise
             raise LinkError(self._sensor_text()) from error
         if not status["sensor_ready"]:
             raise LinkError(stop_sentence(Stop(int(status["stop"])), self.detail))
@@ -368,10 +406,16 @@ class Session:
         self._demand_agreed()  # a drive that restarted sends no heartbeat for good: that says more
         if self._heartbeats.missing:
             return Stop.HEARTBEAT_LOST
+        if self.status()["phase"] != Phase.STOPPED:  # else nothing is enabled before somebody acknowledges
+            for axis, mode in self._modes.items():
+                if self._written_modes.get(axis, mode) != mode:  # a homing's own
+                    self._write_mode(axis, mode)
+                self._demand_mode(axis, mode)
         if self._stopped_meanwhile("enabling the drives"):
             return Stop.OPERATOR
         self._holds_lease = True
         self._reason = ""
+        self.pump()
         self._request(
             mode=int(Mode.TRACK), stop=int(Stop.NONE), law_number=LAW_NAMES.index(law or self.profile.control.law)
         )

@@ -12,13 +12,14 @@ import pytest
 from drivers import cia402
 from drivers.wire import Inbox
 from sim_backend.faults import Fault
+from stagectl import servo_process
 from stagectl.backend import BatchBackend
-from stagectl.errors import DriveError, LinkError, RecordError, RequestError
+from stagectl.errors import DriveError, LinkError, RecordError, RequestError, TimingError
 from stagectl.outcome import BacklashEstimate
 from stagectl.profile import Identity
 from stagectl.record import read_run
 from stagectl.replay import replay
-from stagectl.requests import Phase
+from stagectl.requests import Mode, Phase
 from stagectl.row import SENSOR_BYTES_COUNT
 from stagectl.signals import SETPOINT, STOP_TEXT, Stop
 from stagectl.supervisor import Supervisor
@@ -611,6 +612,44 @@ def test_a_profile_whose_motion_the_cap_forbids_is_not_armed(tmp_path, oled_prof
         arm(oled_profile, BatchBackend(without_deadline(oled_machine), seed=SEED), tmp_path / "run")
 
 
+def test_no_drive_gets_power_without_a_lease(tmp_path, oled_profile, oled_machine):
+    """Not even for the cycles in which it is enabled."""
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        one.stage._request(mode=int(Mode.TRACK))
+        one.stage.pump(0.5)
+        assert Stop(int(one.stage.status()["stop"])) is Stop.LEASE
+        assert one.stage.detail.startswith("there was none when the drives were to get power")
+        assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+        one.stage.acknowledge()
+        assert one.arm() is Stop.NONE
+    phases = read_run(tmp_path / "run").rows["run_phase"]
+    assert phases[np.flatnonzero(phases == Phase.ENABLING)[0] - 1] == Phase.IDLE
+    assert Phase.STOPPED in phases[: np.flatnonzero(phases == Phase.ENABLING)[0]]
+
+
+def test_a_servo_that_hangs_in_a_jog_is_noticed(tmp_path, oled_profile, oled_machine, monkeypatch):
+    """A jog has no end of its own, and what the servo said last is a stage that moves; the drives have stopped it."""
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    wire, asked = one.backend.wire, []
+
+    def wanted():
+        asked.append(wire.t_ns)
+        assert len(asked) < 150
+        if len(asked) == 50:
+            monkeypatch.setattr(one.backend.servo, "cycle", lambda: wire.advance_to(wire.t_ns + 1_000_000))
+        return 0.1
+
+    one.__enter__()
+    assert one.arm() is Stop.NONE
+    with pytest.raises(TimingError, match=r"no cycle for 1\.5 s"):
+        one.stage.jog(wanted)
+    assert abs(one.plant["macro_velocity_m_per_s"]) < REST_M_PER_S
+    with pytest.raises(TimingError, match=r"no cycle for 1\.5 s"):
+        one.stage.close()
+    assert read_run(tmp_path / "run").rows.size == one.backend.servo.ring.written_count
+
+
 def killed_at_speed(folder, profile, machine, wait_s: float) -> Stage:
     """Move, then let nobody of ours live: no cycle, no SDO; `wait_s` pass on the rig."""
 
@@ -644,6 +683,20 @@ def test_a_stage_whose_processes_were_killed_is_armed_again(tmp_path, oled_profi
         home_by_truth(stage, left.plant)
         assert stage.enable() is Stop.NONE
     assert replay(tmp_path / "run").exact
+
+
+def test_a_servo_without_a_supervisor_brings_the_stage_to_rest_and_takes_the_power_away(
+    tmp_path, oled_profile, oled_machine
+):
+    """Nobody is there who could: whoever comes next may be a person with a hand at the stage."""
+    left = killed_at_speed(tmp_path / "killed", oled_profile, oled_machine, 0.0)
+    assert left.drive_states == ("OPERATION_ENABLED", "OPERATION_ENABLED")
+    servo = left.backend.servo
+    nobodys_pid = 0
+    assert servo_process._run(servo, nobodys_pid)
+    assert servo.stop is Stop.SUPERVISOR_SILENT
+    assert left.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")
+    assert abs(left.plant["macro_velocity_m_per_s"]) < REST_M_PER_S
 
 
 def test_a_stage_that_is_still_braking_is_not_let_go(tmp_path, oled_profile, oled_machine):

@@ -1,6 +1,7 @@
 """Opening a stage: what a world needs to be there."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,35 @@ def test_hardware_needs_no_machine_file(tmp_path):
         assert stage.backend.name == "hardware"
     finally:
         stage.backend.close()
+
+
+def test_a_signal_leaves_nothing_of_an_opening_that_failed(tmp_path, monkeypatch):
+    """The service's SIGTERM raises while a world is opened; it must not end the closing of what is there already."""
+
+    class Leaving(Exception):
+        pass
+
+    def leave(number, frame):
+        raise Leaving
+
+    stage = open_stage(load_profile("single-axis"), "batch", runs_root=tmp_path / "runs", name="opened")
+    close, closed = stage.backend.close, []
+
+    def closes():
+        os.kill(os.getpid(), signal.SIGTERM)
+        close()
+        closed.append(True)
+
+    monkeypatch.setattr(stage.backend, "close", closes)
+    stage.folder.mkdir(parents=True, exist_ok=True)
+    (stage.folder / "samples.arrow").mkdir()  # the recorder can't write there
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        with pytest.raises(Leaving):
+            stage.__enter__()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert closed
 
 
 def test_drives_that_are_silent_cost_no_servo(tmp_path):

@@ -55,6 +55,7 @@ def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
     hear_signals(loop)
     listener = Listener(sockets)
     keep_for_good()
+    loop.recall_fault()
     loop.show()  # whoever asks first is answered
     listener.start()
     notifier.say(READY=1, STATUS="listening")

@@ -50,6 +50,19 @@ def of_stop(stop: Stop, detail: str, state: State, at: str, number: int) -> Faul
     )
 
 
+def of_lost_service(since: str, backend: str, state: State, at: str, number: int) -> Fault:
+    """Describe the end of a service that brought its stage to no rest: killed, or the host went off."""
+    return Fault(
+        number=number,
+        kind="SERVICE_LOST",
+        what="the service ended while the stage had power",
+        values=f"in power since {since}, backend {backend}",
+        remedy="see that the stage stands, look into the journal for why it ended, acknowledge, then home",
+        at=at,
+        state=state.value,
+    )
+
+
 def of_error(error: StagectlError, state: State, at: str, number: int) -> Fault:
     """Describe what broke on this side."""
     remedy = _ERROR_REMEDY.get(type(error), "acknowledge")

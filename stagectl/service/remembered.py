@@ -1,4 +1,5 @@
-"""What survives a restart of the service: profile, world, and the backlash that was identified last, with its date.
+"""What survives a restart of the service: profile, world, the backlash that was identified last, with its date, and the
+fault that nobody has acknowledged yet.
 
 Homing does not: a stage that nobody watched may be anywhere.
 """
@@ -12,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stagectl.errors import RecordError
-from stagectl.service.messages import Backlash
+from stagectl.service.messages import Backlash, Fault
 from stagectl.whole_file import replace_whole
 
 FILE = "service.json"
@@ -29,6 +30,10 @@ class Remembered(BaseModel):
     backend: str = ""
     backlash: Backlash | None = None
     faults_count: int = 0
+    fault: Fault | None = None
+    """Not acknowledged yet."""
+    powered_since: str = ""
+    """Empty while no stage has power."""
 
 
 def state_folder() -> Path:
@@ -77,7 +82,7 @@ class Memory:
         except RecordError as error:
             self._refused(str(error))
 
+    @property
     def next_fault_number(self) -> int:
-        """Count a fault; numbers go on over restarts."""
-        self.keep(faults_count=self.now.faults_count + 1)
-        return self.now.faults_count
+        """Number of the next fault; numbers go on over restarts."""
+        return self.now.faults_count + 1

@@ -206,6 +206,7 @@ class StageLoop(StageWatch):
             self._homed = self._homed and not stage.status()["reference_lost"]
             self._enter(Event.ACKNOWLEDGE, "acknowledged")
         self._fault = None
+        self._memory.keep(fault=None)
         order.finish("acknowledged; nothing was enabled", "", "", None)
 
     def _do_backend(self, order: Order) -> None:

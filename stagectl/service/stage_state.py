@@ -73,7 +73,6 @@ class StageState:
         self._order: Order | None = None
         self._late: tuple[float, float] | None = None
         self._late_at_s = 0.0
-        self._cycles_seen, self._cycles_seen_s = -1, 0.0
 
     @property
     def _stop_wanted(self) -> bool:
@@ -93,6 +92,17 @@ class StageState:
         status = self._view()
         self.desk.publish(status, self._state)
         return status
+
+    def recall_fault(self) -> None:
+        """Begin with the fault that nobody has acknowledged, or with the end of a service whose stage had power."""
+        kept = self._memory.now
+        if kept.powered_since:
+            number = self._memory.next_fault_number
+            self._trip(faults.of_lost_service(kept.powered_since, kept.backend, self._state, now_text(), number))
+            self._memory.keep(powered_since="")
+        elif kept.fault is not None:
+            self._fault = kept.fault
+            self._enter(Event.TRIPPED, "not acknowledged before the service ended")
 
     def _look_at_joint(self) -> None:
         """Follow the wear of a joint that works."""
@@ -140,6 +150,8 @@ class StageState:
             self._log.say("state", text, state=self._state.value, before=before.value, because=event.value)
             self._notifier.say(STATUS=f"{self._state.value}, {self._backend or 'no world'}")
         self.desk.powered = self._state in states.POWERED
+        if (before in states.POWERED) is not self.desk.powered:
+            self._memory.keep(powered_since=self._since if self.desk.powered else "")
         if before in states.POWERED and not self.desk.powered:
             self._keep_wear()
         if before in states.POWERED and not self.desk.powered and not self._breaking:
@@ -154,17 +166,17 @@ class StageState:
 
     def _trip(self, fault: messages.Fault) -> None:
         self._fault = fault
+        self._memory.keep(faults_count=fault.number, fault=fault)
         self._recording.save_last(fault.kind)
         self._enter(Event.TRIPPED, fault.what)
         self._log.say("fault", fault.what, **fault.model_dump(exclude={"what", "at"}))
         self._figures.fault(fault.kind)
 
     def _trip_by(self, stop: Stop, stage: Supervisor) -> None:
-        number = self._memory.next_fault_number()
-        self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), number))
+        self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), self._memory.next_fault_number))
 
     def _fault_of(self, error: StagectlError) -> messages.Fault:
-        return faults.of_error(error, self._state, now_text(), self._memory.next_fault_number())
+        return faults.of_error(error, self._state, now_text(), self._memory.next_fault_number)
 
     def _say_not_kept(self, text: str) -> None:
         self._log.say("state_not_kept", text)

@@ -2,13 +2,11 @@
 
 import time
 
-from stagectl.errors import StagectlError, TimingError
+from stagectl.errors import StagectlError
 from stagectl.requests import Phase
 from stagectl.service.stage_world import ENDING, StageWorld
 from stagectl.service.states import Event, State
 from stagectl.signals import Stop
-
-_STALL_S = 1.5  # without a cycle: three times what the servo grants this side
 
 
 class StageWatch(StageWorld):
@@ -24,22 +22,12 @@ class StageWatch(StageWorld):
         except StagectlError as error:
             self._break(error)
             return
-        if self._stands_still(int(status["rows"])):
-            self._break(TimingError(f"the servo has done no cycle for {_STALL_S:g} s; it hangs, or the host does"))
-            return
         if status["reference_lost"]:
             self._homed = False
         if self._state is not State.FAULT and status["phase"] == Phase.STOPPED:
             self._settle()
         elif self._state is State.ARMED and status["phase"] != Phase.TRACKING:
             self._wait_until_it_stands()
-
-    def _stands_still(self, cycles_count: int) -> bool:
-        """Tell whether the servo's counter has stood still for long; a process that is gone is noticed at once."""
-        now_s = time.monotonic()
-        if cycles_count != self._cycles_seen:
-            self._cycles_seen, self._cycles_seen_s = cycles_count, now_s
-        return now_s - self._cycles_seen_s > _STALL_S
 
     def _wait_until_it_stands(self) -> None:
         """Let a stage that stops by itself do so; then say why."""

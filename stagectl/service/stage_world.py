@@ -75,7 +75,6 @@ class StageWorld(StageState):
             self._stage, self._homed, self._waiting_for = stage, False, ""
             self._wear = WearWatch(stage.profile, self._log, time.monotonic)
             self._wear.recall(self._memory.now.backlash)
-            self._cycles_seen = -1
         except Leaving:
             return
         except LinkError as error:

@@ -164,17 +164,23 @@ _CHANGES = (
     ("TPDO1 carries the inputs for the position", 0x1A00, 2, 0x60FD_0020),
     ("TPDO1 off", 0x1800, 1, 0xC000_0180),
     ("RPDO1 off", 0x1400, 1, 0x8000_0200),
+    ("mode of operation: cyclic position", 0x6060, 0, 8),
 )
 
 
 def mapping_changed(rng: np.random.Generator, phase: str) -> Drawn:
-    """Another master's tool configures a drive while it works."""
+    """Another master's tool configures a drive while it works.
+
+    Another mode shows where something is to move; at rest the drive holds, and a homing writes the mode itself.
+    """
     what, index, subindex, value = _of(rng, _CHANGES)
-    node_id = MACRO if index == 0x1A00 else _of(rng, (MACRO, MICRO))
-    if index != 0x1A00:
+    node_id = MACRO if index in (0x1A00, 0x6060) else _of(rng, (MACRO, MICRO))
+    if index in (0x1400, 0x1800):
         value |= node_id
     fault = Fault("object_change", node_id=node_id, index=index, subindex=subindex, value=value)
-    return Drawn(f"node {node_id}: {what}", (fault,), detection_s=SILENCE_S)
+    must = index != 0x6060 or phase not in ("at rest", "homing")
+    detection_s = SILENCE_S if must else NEVER_S
+    return Drawn(f"node {node_id}: {what}", (fault,), must_stop=must, detection_s=detection_s)
 
 
 def drive_heartbeat_lost(rng: np.random.Generator, phase: str) -> Drawn:

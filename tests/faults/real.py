@@ -210,11 +210,13 @@ def _watch(house: House, kind: Kind, before: dict) -> tuple[list[tuple[str, str]
         time.sleep(LOOK_S)
     house.let_go()
     stands_m, found = state["plant"]["macro_position_m"], []
-    powered = state["drives"]["1"] not in ("SWITCH_ON_DISABLED", "FAULT")
+    held_m = stands_m
     for _ in range(15):
         time.sleep(LOOK_S)
         with contextlib.suppress(LinkError):  # of a killed service the rig ends after a while
             state = house.state()
-    if powered and abs(state["plant"]["macro_position_m"] - stands_m) > STANDSTILL_M:
+        if state["drives"]["1"] not in ("SWITCH_ON_DISABLED", "FAULT"):
+            held_m = state["plant"]["macro_position_m"]
+    if abs(held_m - stands_m) > STANDSTILL_M:
         found.append((STANDSTILL, "it moved after standstill"))
     return found, travel_m, state

@@ -13,6 +13,8 @@ from stage_pc import PORT, UNIT, check, report, rig, servo_pid, shell, stage, un
 FAR_M, STRUCK_M = 0.1, 0.03
 HOMING_M_PER_S = 0.02  # stage-100hz.toml
 AT_REST_M_PER_S = 2e-4
+COASTS_M_PER_S = 5e-3  # cogging and cables pull at a macro without power
+_WITH_POWER = {"OPERATION_ENABLED", "QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE"}
 # Heartbeat time of the drives, the ramp from the speed limit, and how seldom it is looked at; a servo that lost its
 # supervisor waits for it first.
 DRIVES_STOP_S = 5.0
@@ -54,12 +56,20 @@ def stops(what: str, began_s: float, limit_s: float = DRIVES_STOP_S) -> None:
 
     def rests() -> bool:
         state = rig.state()
-        slow = abs(state["plant"]["macro_velocity_m_per_s"]) < AT_REST_M_PER_S
+        speed_m_per_s = abs(state["plant"]["macro_velocity_m_per_s"])
+        held = "QUICK_STOP_ACTIVE" in state["drives"].values()
+        slow = speed_m_per_s < (AT_REST_M_PER_S if held else COASTS_M_PER_S)
         return slow and "OPERATION_ENABLED" not in state["drives"].values()
 
-    until(f"{what}: rest without power", rests, REST_PATIENCE_S)
+    until(f"{what}: rest", rests, REST_PATIENCE_S)
     took_s = time.monotonic() - began_s
     check(f"{what}: the drives stop the stage", took_s < limit_s, f"{took_s:.1f} s, {rig.state()['drives']}")
+
+
+def loses_power(what: str, restarts: int) -> None:
+    """Wait until no drive has power; nobody but the servo that is left alone can have taken it."""
+    until(f"{what}: no power", lambda: not _WITH_POWER & set(rig.state()["drives"].values()), REST_PATIENCE_S)
+    check(f"{what}: the servo takes the power away", int(unit("NRestarts")) == restarts, rig.state()["drives"])
 
 
 def faulted(what: str, *kinds: str) -> None:
@@ -168,6 +178,7 @@ def _without_supervisor(what: str, number: signal.Signals) -> None:
         began_s = time.monotonic()
         os.kill(int(unit("MainPID")), number)
         stops(what, began_s, SERVO_STOPS_S)
+        loses_power(what, before)
     await_restart(what, before)
     recovers(what)
 

@@ -227,6 +227,9 @@ def test_kill_9_of_the_daemon_stops_the_stage_and_loses_no_row(tmp_path):
         (folder,) = daemon.runs.glob("*-service-arm")
         record = read_run(folder).manifest["record"]
         assert (record["state"], record["rows_lost_count"]) == ("recovered", 0)
+        daemon.start()
+        daemon.state_is("fault")
+        assert daemon.client.fault().kind == "SERVICE_LOST"
     finally:
         daemon.end()
 

@@ -70,6 +70,27 @@ def test_a_servo_that_hangs_is_noticed(idle):
         os.kill(pid, signal.SIGCONT)  # it hears that it was asked to leave
 
 
+def test_a_servo_that_hangs_in_motion_is_recovered_from(idle):
+    """The drives stop the stage; nobody waits for the motion's end, or for systemd's watchdog."""
+    client = idle.client
+    with client.lease("anna"):
+        move_away(client)
+        idle.until(lambda: abs(idle.plant["macro_velocity_m_per_s"]) > 0.05, "speed")
+        servo = servo_pid(idle)
+        os.kill(servo, signal.SIGSTOP)
+        try:
+            idle.state_is("fault")
+        finally:
+            os.kill(servo, signal.SIGKILL)  # as the service does itself, after its patience
+        fault = client.fault()
+        assert (fault.kind, fault.state) == ("TimingError", "moving")
+        client.acknowledge(fault.number)
+    idle.state_is("idle")
+    with client.lease("anna"):
+        idle.finishes(client.home)
+        idle.finishes(client.arm)
+
+
 def test_the_world_is_changed_without_power_only_and_every_client_is_told(idle):
     client = idle.client
     with client.lease("anna"):

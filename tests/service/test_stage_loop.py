@@ -29,13 +29,14 @@ PATIENCE_S = 60.0
 class Bench:
     """A loop in virtual time, driven step by step, and one operator."""
 
-    def __init__(self, folder, profile="single-axis", backend="batch"):
+    def __init__(self, folder, profile="single-axis", backend="batch", remembered=None):
         self.log = ServiceLog(None)
         self.now_s = 0.0
         self.desk = Desk(self.log, lambda: self.now_s)
         self.figures = Figures()
         self.settings = Settings(profile, backend, folder / "runs", folder / "state")
-        self.loop = StageLoop(self.settings, self.desk, self.log, Remembered(), Notifier({}), self.figures)
+        remembered = remembered or Remembered()
+        self.loop = StageLoop(self.settings, self.desk, self.log, remembered, Notifier({}), self.figures)
         self.token = ""
         self.keys = 0
 
@@ -312,6 +313,38 @@ def test_a_lost_beam_is_a_fault_and_voids_the_homing(armed):
     assert armed.do("home", messages.Home()).stop == "FINISHED"
     assert armed.status.homed
     assert recall(armed.settings.state_folder)[0].faults_count >= number
+
+
+def restarted(folder, remembered):
+    """Return the bench of a service that begins with what the last one kept."""
+    bench = Bench(folder, remembered=remembered)
+    bench.loop.recall_fault()
+    bench.loop.step()
+    return bench
+
+
+def test_a_service_that_ended_with_power_on_says_so_at_its_next_start(armed, tmp_path):
+    kept, _ = recall(armed.settings.state_folder)
+    bench = restarted(tmp_path, kept)
+    fault = bench.status.fault
+    assert (bench.status.state, fault.kind, fault.number) == ("fault", "SERVICE_LOST", kept.faults_count + 1)
+    assert fault.values == f"in power since {kept.powered_since}, backend batch"
+    again = restarted(tmp_path, recall(tmp_path / "state")[0])
+    assert again.status.fault == fault
+    again.take()
+    assert again.do("acknowledge", messages.Acknowledge(number=fault.number)).state == "done"
+    again.until(lambda: again.status.state == "idle")
+    again.loop.leave()
+    again.loop.run()
+    ended, _ = recall(tmp_path / "state")
+    assert (ended.fault, ended.powered_since) == (None, "")
+
+
+def test_a_fault_is_there_until_it_is_acknowledged_whatever_restarts(armed, tmp_path):
+    armed.inject(Fault("beam_loss", duration_s=0.3, axis="both"))
+    armed.until(lambda: armed.status.state == "fault")
+    bench = restarted(tmp_path, recall(armed.settings.state_folder)[0])
+    assert (bench.status.state, bench.status.fault) == ("fault", armed.status.fault)
 
 
 def test_what_clients_see_is_counted(armed):
