@@ -22,6 +22,8 @@ try:
 except ImportError:
     pytest.skip("no playwright here: pip install -e '.[dev]'", allow_module_level=True)
 if CHROMIUM is None:
+    if os.environ.get("STAGECTL_NEEDS_CHROMIUM"):
+        pytest.fail("no Chromium here, and STAGECTL_NEEDS_CHROMIUM asks for one: apt install chromium", pytrace=False)
     pytest.skip("no Chromium here: apt install chromium", allow_module_level=True)
 
 pytestmark = pytest.mark.real_time
