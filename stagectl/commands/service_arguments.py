@@ -16,8 +16,8 @@ ServedProfile = Annotated[
 ServedBackend = Annotated[
     str,
     option(
-        "auto | hardware | rig | rig-drives | rig-sensor. auto takes the rig only where neither the profile's CAN "
-        "interface nor its serial port exists, once, and says so.",
+        "hardware | rig | rig-drives | rig-sensor | auto. hardware is waited for; auto takes the rig where neither the "
+        "profile's CAN interface nor its serial port exists, once, and says so.",
         "--backend",
         metavar="WORLD",
     ),
@@ -65,7 +65,7 @@ _USUAL_PROFILE = "oled-printer"
 )
 def serve(
     profile: ServedProfile = None,
-    backend: ServedBackend = "auto",
+    backend: ServedBackend = "hardware",
     seed: Seed = 1,
     runs: ServedRuns = Path("runs"),
     socket: Socket = None,

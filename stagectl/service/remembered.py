@@ -28,6 +28,9 @@ class Remembered(BaseModel):
     """Path or name that the profile was read from."""
     profile_name: str = ""
     backend: str = ""
+    """World that was open last, or was asked for since."""
+    swapped_from: str = ""
+    """What the service was started with when a client chose that world; empty where none did."""
     backlash: Backlash | None = None
     faults_count: int = 0
     fault: Fault | None = None

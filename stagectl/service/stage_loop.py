@@ -218,6 +218,7 @@ class StageLoop(StageWatch):
         if chosen != self._backend:
             self._close_stage()
             self._backend, self._backend_asked, self._retry_at_s = chosen, order.body.backend, 0.0
+            self._memory.keep(profile=str(profile.source_path), backend=chosen, swapped_from=self.settings.backend)
         order.finish(BANNERS[chosen], "", "", None)
 
     def _do_reread(self, order: Order) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from stagectl.errors import LinkError, ProfileError, RequestError, StagectlError
-from stagectl.profile import load_profile
+from stagectl.profile import Profile, load_profile
 from stagectl.run_folder import give_back
 from stagectl.service import states
 from stagectl.service.scope import Scope
@@ -37,7 +37,7 @@ class StageWorld(StageState):
         try:
             profile = self._profile = load_profile(self._profile_asked)
             if not self._backend:
-                self._backend = choose(profile, self._backend_asked)
+                self._backend, self._backend_asked = self._world_to_begin_with(profile)
                 self._log.say("backend", BANNERS[self._backend], backend=self._backend, asked=self._backend_asked)
             absent = missing(profile, self._backend, self.settings.runs_root)
             if absent:
@@ -93,6 +93,21 @@ class StageWorld(StageState):
         self.desk.profile = stage.profile
         self._memory.keep(profile=str(profile.source_path), profile_name=profile.name, backend=self._backend)
         self._enter(Event.CONNECTED, stage.backend.description)
+
+    def _world_to_begin_with(self, profile: Profile) -> tuple[str, str]:
+        """Return the world and what asked for it: a client before the restart, else how the service was started.
+
+        A swap counts for the profile it was made with and for as long as the service is started in the same way. Where
+        `auto` once found hardware, hardware that is late at the next start is waited for.
+        """
+        asked, kept = self._backend_asked, self._memory.now
+        if kept.profile == str(profile.source_path):
+            if kept.swapped_from == asked:
+                return kept.backend, "a client before the restart"
+            if asked == "auto" and kept.backend == "hardware" and not kept.swapped_from:
+                return kept.backend, "auto, at an earlier start"
+        self._memory.keep(swapped_from="")
+        return choose(profile, asked), asked
 
     def _wait_for(self, what: str) -> None:
         if what != self._waiting_for:

@@ -377,6 +377,35 @@ def test_hardware_that_is_not_there_is_waited_for(tmp_path):
     bench.desk.close()
     with pytest.raises(Ending):
         bench.begin("home", messages.Home())
+    kept, _ = recall(bench.settings.state_folder)
+    assert (kept.backend, kept.swapped_from) == ("rig", "hardware")
+
+
+@pytest.mark.parametrize(
+    ("asked", "swapped_from", "profile", "begun"),
+    [
+        ("hardware", "hardware", "single-axis", "batch"),
+        ("hardware", "rig", "single-axis", "hardware"),  # started in another way since
+        ("hardware", "hardware", "oled-printer", "hardware"),
+        ("hardware", "", "single-axis", "hardware"),
+    ],
+)
+def test_the_world_that_a_client_swapped_to_is_there_after_a_restart(tmp_path, asked, swapped_from, profile, begun):
+    path = str(PROFILES_FOLDER / f"{profile}.toml")
+    kept = Remembered(profile=path, backend="batch", swapped_from=swapped_from)
+    bench = Bench(tmp_path, backend=asked, remembered=kept)
+    bench.loop.step()
+    assert bench.status.backend == begun
+    assert bench.status.banner.startswith("SOFTWARE" if begun == "batch" else "HARDWARE")
+    bench.loop.leave()
+    bench.loop.run()
+
+
+def test_where_auto_once_found_hardware_late_hardware_is_waited_for(tmp_path):
+    path = str(PROFILES_FOLDER / "single-axis.toml")
+    bench = Bench(tmp_path, backend="auto", remembered=Remembered(profile=path, backend="hardware"))
+    bench.loop.step()
+    assert (bench.status.state, bench.status.backend) == ("off", "hardware")
 
 
 def test_a_profile_edited_to_nonsense_changes_nothing(tmp_path):
