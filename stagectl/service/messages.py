@@ -178,6 +178,8 @@ class Backlash(BaseModel):
     """When, UTC."""
     run: str
     profile_name: str
+    backend: str
+    """World that it is of: the rig's joint is not the machine's."""
 
 
 class Wear(BaseModel):

@@ -31,7 +31,8 @@ class Remembered(BaseModel):
     """World that was open last, or was asked for since."""
     swapped_from: str = ""
     """What the service was started with when a client chose that world; empty where none did."""
-    backlash: Backlash | None = None
+    joints: dict[str, Backlash] = {}
+    """By world and profile: what the rig's joint is says nothing of the machine's."""
     faults_count: int = 0
     fault: Fault | None = None
     """Not acknowledged yet."""
@@ -84,6 +85,14 @@ class Memory:
             keep(self._folder, self.now)
         except RecordError as error:
             self._refused(str(error))
+
+    def joint(self, backend: str, profile_name: str) -> Backlash | None:
+        """Return what a joint was when it was identified last; None where nobody did."""
+        return self.now.joints.get(f"{backend} {profile_name}")
+
+    def keep_joint(self, found: Backlash) -> None:
+        """Keep what a joint was identified as, beside those of other worlds."""
+        self.keep(joints={**self.now.joints, f"{found.backend} {found.profile_name}": found})
 
     @property
     def next_fault_number(self) -> int:

@@ -166,8 +166,8 @@ class StageLoop(StageWatch):
         estimate, stage = outcome.backlash, self._stage
         if estimate is None or not outcome.finished or not estimate.identifiable or stage is None:
             return None
-        found = backlash_message(estimate, run, stage.profile.name, now_text())
-        self._memory.keep(backlash=found)
+        found = backlash_message(estimate, run, stage.profile.name, self._backend, now_text())
+        self._memory.keep_joint(found)
         return found
 
     def _needs_anew(self, stage: Supervisor) -> bool:

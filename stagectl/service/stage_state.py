@@ -121,10 +121,14 @@ class StageState:
 
     def _keep_wear(self) -> None:
         """Have what production motion showed survive a restart."""
-        found = None if self._wear is None or self._stage is None else self._wear.newest_of_production()
-        if found is not None and self._stage is not None:
-            run = self._recording.folder(self._stage.folder).name
-            self._memory.keep(backlash=backlash_message(found, run, self._stage.profile.name, now_text()))
+        wear, stage = self._wear, self._stage
+        found = None if wear is None else wear.newest_of_production()
+        if wear is None or found is None or stage is None:
+            return
+        name, run = stage.profile.name, self._recording.folder(stage.folder).name
+        before = self._memory.joint(self._backend, name)
+        if before is None or before.at != wear.seen_at:  # not what an earlier motion showed, as if it were news
+            self._memory.keep_joint(backlash_message(found, run, name, self._backend, wear.seen_at))
 
     def _heed_record_requests(self) -> None:
         """Begin or end a run that a client asked for; motions go on meanwhile."""
@@ -208,7 +212,7 @@ class StageState:
             positions=positions(status),
             health=health(status, profile.cycle.rate_hz if profile is not None else 0.0, self._late),
             temperatures=temperatures(stage.temperatures) if stage is not None and connected else {},
-            backlash=self._memory.now.backlash,
+            backlash=None if profile is None else self._memory.joint(self._backend, profile.name),
             wear=None if self._wear is None else self._wear.message(),
             fault=self._fault,
             lease=self.desk.lease_state(),

@@ -74,7 +74,7 @@ class StageWorld(StageState):
             stage.__enter__()
             self._stage, self._homed, self._waiting_for = stage, False, ""
             self._wear = WearWatch(stage.profile, self._log, time.monotonic)
-            self._wear.recall(self._memory.now.backlash)
+            self._wear.recall(self._memory.joint(self._backend, stage.profile.name))
         except Leaving:
             return
         except LinkError as error:
@@ -118,7 +118,7 @@ class StageWorld(StageState):
 
     def _close_stage(self) -> None:
         """Let go of the world, whatever that says."""
-        stage, self._stage = self._stage, None
+        stage, self._stage, self._wear = self._stage, None, None
         self._homed = False
         self.desk.profile = None
         if stage is not None:

@@ -21,8 +21,10 @@ BANNERS = {
 """Which world this is, for every client to show."""
 
 
-def backlash_message(estimate: BacklashEstimate, run: str, profile_name: str, at: str) -> messages.Backlash:
-    """Lay an estimate out with its date."""
+def backlash_message(
+    estimate: BacklashEstimate, run: str, profile_name: str, backend: str, at: str
+) -> messages.Backlash:
+    """Lay an estimate out with its date and the world that it is of."""
     return messages.Backlash(
         width_m=estimate.width_m,
         centre_m=estimate.centre_m,
@@ -34,6 +36,7 @@ def backlash_message(estimate: BacklashEstimate, run: str, profile_name: str, at
         at=at,
         run=run,
         profile_name=profile_name,
+        backend=backend,
     )
 
 

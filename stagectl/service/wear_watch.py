@@ -28,12 +28,12 @@ class WearWatch:
     """Follows the joint of one profile."""
 
     def __init__(self, profile: Profile, log: ServiceLog, now_s: Callable[[], float]):
-        """`now_s` goes on while the service runs. Nothing is known yet."""
+        """`now_s` goes on while the service runs. Nothing is known yet; `seen_at`: when something was."""
         self._profile, self._log, self._now_s = profile, log, now_s
         self._tracker: WearTracker | None = None
         self._looked_s = self._probed_s = -math.inf
         self._told = ""
-        self._believed_since = self._at = ""
+        self._believed_since = self.seen_at = ""
         joint = profile.backlash
         if profile.micro is None or joint is None:
             return
@@ -51,8 +51,8 @@ class WearWatch:
         )
 
     def recall(self, last: messages.Backlash | None) -> None:
-        """Go on from what an earlier session identified."""
-        if self._tracker is None or last is None or last.profile_name != self._profile.name:
+        """Go on from what this world's joint was identified as earlier."""
+        if self._tracker is None or last is None:
             return
         sd_m = math.inf if last.width_sd_m is None else last.width_sd_m / math.sqrt(2.0)
         values = {name: getattr(last, name) for name in ("left_m", "right_m")}
@@ -63,7 +63,7 @@ class WearWatch:
         estimate = BacklashEstimate(**values, **unknown, left_sd_m=sd_m, right_sd_m=sd_m)
         age_s = (datetime.now(UTC) - datetime.fromisoformat(last.at)).total_seconds()
         self._tracker.go_on_from(Look(self._now_s() - max(age_s, 0.0), estimate, IDENTIFIED))
-        self._at = last.at
+        self.seen_at = last.at
 
     def observe(self, rows: np.ndarray) -> None:
         """Note from rows, shape (n,) of ROW, which edges were pressed."""
@@ -81,14 +81,14 @@ class WearWatch:
             return
         self._looked_s = now_s
         if self._tracker.look(estimate, now_s, PRODUCTION):
-            self._at = now_text()
+            self.seen_at = now_text()
         self._tell()
 
     def found(self, estimate: BacklashEstimate | None, source: str) -> None:
         """Take what an identification, a homing or a probe found."""
         if self._tracker is not None and estimate is not None:
             if self._tracker.look(estimate, self._now_s(), source):
-                self._at = now_text()
+                self.seen_at = now_text()
             self._tell()
 
     def _tell(self) -> None:
@@ -150,7 +150,7 @@ class WearWatch:
             right_stiffness_sd_n_per_m=finite(one.right_stiffness_sd_n_per_m),
             width_m=one.width_m,
             width_sd_m=finite(tracker.sd_m(now_s)),
-            at=self._at,
+            at=self.seen_at,
             age_s=age_s,
             source=newest.source,
             observable=observable,

@@ -124,8 +124,9 @@ def test_the_state_survives_and_a_damaged_one_is_said(tmp_path):
     backlash = messages.Backlash(
         width_m=2e-4, centre_m=1e-5, left_m=9e-5, right_m=1.1e-4, left_stiffness_n_per_m=1e4,
         right_stiffness_n_per_m=1.2e4, width_sd_m=1e-7, at="2026-11-22T02:00:00+00:00", run="r", profile_name="p",
+        backend="rig",
     )  # fmt: skip
-    remembered = Remembered(profile="/etc/stagectl/p.toml", profile_name="p", backend="rig", backlash=backlash)
+    remembered = Remembered(profile="/etc/stagectl/p.toml", profile_name="p", backend="rig", joints={"rig p": backlash})
     assert recall(tmp_path) == (Remembered(), "")
     keep(tmp_path / "deep", remembered)
     assert recall(tmp_path / "deep") == (remembered, "")

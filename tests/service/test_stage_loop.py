@@ -7,6 +7,7 @@ import pytest
 from drivers import cia402
 from sim_backend.faults import Fault
 from stagectl.errors import RequestError
+from stagectl.outcome import BacklashEstimate
 from stagectl.profile import PROFILES_FOLDER
 from stagectl.requests import Mode
 from stagectl.service import messages
@@ -19,6 +20,7 @@ from stagectl.service.service_log import ServiceLog
 from stagectl.service.stage_loop import StageLoop
 from stagectl.service.stage_state import Settings
 from stagectl.signals import Stop
+from stagectl.wear import PRODUCTION
 from tests.toml_text import changed
 
 pytestmark = pytest.mark.real_time
@@ -399,6 +401,41 @@ def test_the_world_that_a_client_swapped_to_is_there_after_a_restart(tmp_path, a
     assert bench.status.banner.startswith("SOFTWARE" if begun == "batch" else "HARDWARE")
     bench.loop.leave()
     bench.loop.run()
+
+
+def test_the_joint_of_one_world_is_not_shown_in_another_and_keeps_the_date_it_was_seen_at(tmp_path):
+    rigs = messages.Backlash(
+        width_m=2e-4, centre_m=0.0, left_m=1e-4, right_m=1e-4, left_stiffness_n_per_m=1e4,
+        right_stiffness_n_per_m=1e4, width_sd_m=1e-7, at="2026-01-01T00:00:00.000+00:00", run="r",
+        profile_name="oled-printer", backend="rig",
+    )  # fmt: skip
+    bench = Bench(tmp_path, profile="oled-printer", remembered=Remembered(joints={"rig oled-printer": rigs}))
+    bench.loop.step()
+    bench.until(lambda: bench.status.state == "idle")
+    assert (bench.status.backlash, bench.status.wear) == (None, None)
+    bench.take()
+    assert bench.do("home", messages.Home()).stop == "FINISHED"
+    seen = set()
+    for value_m in (1e-4, None):
+        if bench.status.state == "idle":  # homing leaves it armed
+            assert bench.do("arm", messages.Arm()).stop == "FINISHED"
+        if value_m is not None:
+            sides = {f"{side}_{what}": 1e-7 for side in ("left", "right") for what in ("sd_m", "stiffness_sd_n_per_m")}
+            values = {"left_m": value_m, "right_m": value_m} | sides
+            stiff = {"left_stiffness_n_per_m": 1e4, "right_stiffness_n_per_m": 1e4}
+            bench.loop._wear.found(BacklashEstimate(**values, **stiff), PRODUCTION)
+            seen_at = bench.loop._wear.seen_at
+        time.sleep(0.002)  # dates are in milliseconds
+        bench.desk.ask_to_stop("enough")
+        bench.until(lambda: bench.status.state == "idle")
+        seen.add((bench.status.backlash.at, bench.status.backlash.backend))
+    assert seen == {(seen_at, "batch")}
+    kept, _ = recall(bench.settings.state_folder)
+    assert kept.joints["rig oled-printer"] == rigs
+    bench.loop.leave()
+    bench.loop.run()
+    bench.loop.show()
+    assert bench.status.wear is None
 
 
 def test_where_auto_once_found_hardware_late_hardware_is_waited_for(tmp_path):
