@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import structlog
 
 from stagectl.errors import RecordError
@@ -25,11 +26,11 @@ from stagectl.samples_file import (
     BATCH_NS,
     BATCH_ROWS_COUNT,
     END_MARKER,
-    Piece,
     batch_ends,
     empty_rows,
     encode_batch,
     encode_schema,
+    extent,
     fill_rows,
     is_closed,
     scan,
@@ -390,14 +391,12 @@ def read_batches(folder: Path) -> Iterator[np.ndarray]:
     path = Path(folder) / SAMPLES
     for piece in scan(path):
         if piece.batch is not None and len(piece.batch):
-            yield _rows_of(piece, path)
+            yield _rows_of(piece.batch, piece.schema, path)
 
 
-def _rows_of(piece: Piece, path: Path) -> np.ndarray:
-    if piece.batch is None:
-        return np.zeros(0, ROW)
-    rows = empty_rows(len(piece.batch), piece.schema)
-    fill_rows(rows, piece.batch, str(path))
+def _rows_of(batch: pa.RecordBatch, schema: pa.Schema, path: Path) -> np.ndarray:
+    rows = empty_rows(len(batch), schema)
+    fill_rows(rows, batch, str(path))
     return rows
 
 
@@ -406,6 +405,16 @@ def recorded_fields(folder: Path) -> tuple[str, ...]:
     for piece in scan(Path(folder) / SAMPLES):
         return tuple(piece.schema.names)
     return ()
+
+
+def recorded_extent(folder: Path) -> tuple[int, int | None, int | None]:
+    """Return how many rows a run's samples file has, and the times of the first and the last one; reads hardly any."""
+    path = Path(folder) / SAMPLES
+    found = extent(path)
+    before = [_rows_of(batch, found.schema, path) for batch in (found.first, found.last) if batch is not None]
+    if not before:
+        return found.rows_count, None, None
+    return found.rows_count, int(before[0]["t_ns"][0]), int(before[-1]["t_ns"][-1])
 
 
 def read_run(folder: Path) -> Run:
@@ -418,7 +427,7 @@ def read_run(folder: Path) -> Run:
         for piece in scan(path):
             names, end_bytes = tuple(piece.schema.names), piece.end_bytes
             if piece.batch is not None and len(piece.batch):
-                parts.append(_rows_of(piece, path))
+                parts.append(_rows_of(piece.batch, piece.schema, path))
     events, events_cut = _read_events(folder / EVENTS)
     return Run(
         folder=folder,
@@ -520,9 +529,9 @@ def _save(
     except OSError as error:
         raise RecordError(f"{folder}: can't go on with {SAMPLES}: {error.strerror}; check permissions") from error
     try:
-        recovery = _join(samples, folder, manifest, held_rows, overwritten_count)
+        recovery, whole = _join(samples, folder, manifest, held_rows, overwritten_count)
         samples.put(END_MARKER)
-        _finish_recovered(folder, manifest, recovery)
+        _finish_recovered(folder, manifest, recovery, whole)
     except OSError as error:
         raise RecordError(
             f"{folder}: can't write recovered rows: {error.strerror} ({free_text(folder)}); {otherwise}; "
@@ -535,13 +544,15 @@ def _save(
 
 def _join(
     samples: WholeFile, folder: Path, manifest: dict, held_rows: np.ndarray, overwritten_count: int | None
-) -> Recovery:
-    """Cut the samples at their last whole batch and append the rows that are newer. Errors: RecordError, OSError."""
-    schema, end_bytes, last = None, 0, None
-    for piece in scan(folder / SAMPLES):
-        schema, end_bytes = piece.schema, piece.end_bytes
-        if piece.batch is not None and len(piece.batch):
-            last = _rows_of(piece, folder / SAMPLES)[-1]
+) -> tuple[Recovery, dict[str, int | None]]:
+    """Cut the samples at their last whole batch and append the rows that are newer. Errors: RecordError, OSError.
+
+    Returns what was saved, and how many rows of which times the run has now.
+    """
+    found = extent(folder / SAMPLES)
+    schema = found.schema
+    before = [_rows_of(batch, schema, folder / SAMPLES) for batch in (found.first, found.last) if batch is not None]
+    last = before[-1][-1] if before else None
     if len(held_rows) and schema is not None and not schema.equals(schema_of()):
         raise RecordError(
             f"{folder}: {SAMPLES} has another layout than the ring; recover with the version that made it"
@@ -552,28 +563,27 @@ def _join(
     if overwritten_count and last is not None:  # the file may have them
         apart = len(rows) == len(held_rows) and len(rows) > 0
         lost_count = max(0, int(rows["cycle"][0]) - int(last["cycle"]) - 1) if apart else 0
-    samples.cut(end_bytes)
+    samples.cut(found.end_bytes)
     if schema is None:
         samples.put(encode_schema(schema_of()))
     start = 0
     for end in batch_ends(rows["t_ns"]):
         samples.put(encode_batch(to_batch(rows[start:end], schema_of())))
         start = end
-    return Recovery(rows_count=len(rows), rows_lost_count=lost_count)
+    times_ns = [int(part["t_ns"][at]) for part in (*before, rows) if len(part) for at in (0, -1)]
+    whole = {
+        "rows_count": found.rows_count + len(rows),
+        "first_t_ns": times_ns[0] if times_ns else None,
+        "last_t_ns": times_ns[-1] if times_ns else None,
+    }
+    return Recovery(rows_count=len(rows), rows_lost_count=lost_count), whole
 
 
-def _finish_recovered(folder: Path, manifest: dict, recovery: Recovery) -> None:
-    """Say in events and manifest what was recovered. Errors: OSError."""
-    count, first_t_ns, last_t_ns = 0, None, None
-    for rows in read_batches(folder):
-        first_t_ns = int(rows["t_ns"][0]) if first_t_ns is None else first_t_ns
-        last_t_ns = int(rows["t_ns"][-1])
-        count += len(rows)
+def _finish_recovered(folder: Path, manifest: dict, recovery: Recovery, whole: dict[str, int | None]) -> None:
+    """Say in events and manifest what was recovered, and of what run. Errors: OSError."""
     state = {
         "state": "recovered",
-        "rows_count": count,
-        "first_t_ns": first_t_ns,
-        "last_t_ns": last_t_ns,
+        **whole,
         "rows_recovered_count": recovery.rows_count,
         "rows_lost_count": recovery.rows_lost_count,
     }
@@ -584,8 +594,8 @@ def _finish_recovered(folder: Path, manifest: dict, recovery: Recovery) -> None:
         events.cut(content.rfind(b"\n") + 1)
         _structured_log(events.put).info(
             "recovered",
-            t_ns=last_t_ns or 0,
-            row=count,
+            t_ns=whole["last_t_ns"] or 0,
+            row=whole["rows_count"],
             rows_recovered_count=recovery.rows_count,
             rows_lost_count=recovery.rows_lost_count,
         )

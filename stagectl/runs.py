@@ -19,7 +19,17 @@ from pydantic import ValidationError
 
 from stagectl.errors import RecordError, RequestError
 from stagectl.profile import Profile
-from stagectl.record import MANIFEST, SAMPLES, Run, free_text, read_batches, read_manifest, read_run, recorded_fields
+from stagectl.record import (
+    MANIFEST,
+    SAMPLES,
+    Run,
+    free_text,
+    read_batches,
+    read_manifest,
+    read_run,
+    recorded_extent,
+    recorded_fields,
+)
 from stagectl.row import ROW
 from stagectl.samples_file import END_MARKER, schema_of, to_batch
 from stagectl.signals import Stop, stop_sentence
@@ -104,12 +114,10 @@ def _summary(folder: Path, count_under_way: bool) -> RunSummary:
         if state == "recording":
             state = "recording" if is_held(folder / SAMPLES) else "crashed"
             count = 0
-            for rows in read_batches(folder) if count_under_way or state == "crashed" else ():
-                first_t_ns = int(rows["t_ns"][0]) if first_t_ns is None else first_t_ns
-                last_t_ns = int(rows["t_ns"][-1])
-                count += len(rows)
+            if (count_under_way or state == "crashed") and (folder / SAMPLES).exists():
+                count, first_t_ns, last_t_ns = recorded_extent(folder)
         elif count and not _has_end(folder / SAMPLES):
-            found = sum(len(rows) for rows in read_batches(folder)) if (folder / SAMPLES).exists() else 0
+            found = recorded_extent(folder)[0] if (folder / SAMPLES).exists() else 0
             if found < count:
                 state, note, count = "damaged", missing_text(count - found, count), found
     except RecordError as error:

@@ -28,7 +28,7 @@ from stagectl.record import (
 )
 from stagectl.ring import RingReader, RingWriter
 from stagectl.row import ROW, new_rows
-from stagectl.samples_file import END_MARKER, scan, schema_of
+from stagectl.samples_file import END_MARKER, extent, scan, schema_of
 from stagectl.signals import Stop
 from tests.small_disk import small_disk
 
@@ -252,6 +252,40 @@ def test_cut_at_every_byte_of_the_last_batch_all_whole_batches_are_read(tmp_path
         count = 6 if size_bytes == end_bytes else 4
         for name in schema_of(fields).names:
             assert run.rows[name].tobytes() == rows[name][:count].tobytes()
+
+
+def counted(path):
+    """Return (rows, end, time of the last row) by reading every batch."""
+    pieces = [piece for piece in scan(path)]
+    full = [piece.batch for piece in pieces if piece.batch is not None and len(piece.batch)]
+    last_t_ns = full[-1].column("t_ns")[-1].as_py() if full else None
+    return sum(map(len, full)), pieces[-1].end_bytes if pieces else 0, last_t_ns
+
+
+def test_the_extent_of_a_file_is_what_reading_all_of_it_gives(tmp_path):
+    """Of 400 batches, most of them not read; whole, cut in a batch, a heading, the schema, damaged, empty."""
+    rows = new_rows(800)
+    rows["cycle"] = np.arange(1, 801)
+    rows["t_ns"] = rows["cycle"] * 100_000_000
+    with Recorder(tmp_path / "run", {}, ["t_ns", "cycle"]) as recorder:
+        recorder.append(rows)
+    path = tmp_path / "run" / "samples.arrow"
+    content = path.read_bytes()
+    ends = [piece.end_bytes for piece in scan(path)]
+    assert len(ends) == 401
+    random = np.random.default_rng(3)
+    cuts = [len(content), ends[0], ends[0] - 1, 3, 0, ends[7] + 3, ends[300], *random.integers(0, len(content), 40)]
+    for size_bytes in cuts:
+        path.write_bytes(content[:size_bytes])
+        found = extent(path)
+        last_t_ns = None if found.last is None else found.last.column("t_ns")[-1].as_py()
+        assert (found.rows_count, found.end_bytes, last_t_ns) == counted(path), size_bytes
+    for at in (ends[-2] + 8, ends[-3] + 20, ends[-40] + 4, ends[-5] + 300):
+        path.write_bytes(content[:at] + b"\xff" * 8 + content[at + 8 :])
+        found = extent(path)
+        assert (found.rows_count, found.end_bytes) == counted(path)[:2], at
+    path.write_bytes(content[:-40] + bytes(4000))
+    assert (extent(path).rows_count, extent(path).end_bytes) == counted(path)[:2]
 
 
 @pytest.mark.parametrize("tail", [bytes(5000), b"\xff" * 64, b"garbage of a dying disk" * 100])
