@@ -2,8 +2,8 @@
 
 import shutil
 import threading
+import time
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -184,12 +184,13 @@ class Recording:
         self._over.set()
 
     def _prune(self) -> None:
+        looked_s = time.monotonic()
         while True:
             profile = self._profile
             if profile is not None:
-                now_s = datetime.now(UTC).timestamp()
-                limits = profile.record
-                for gone in prune(self._runs_root, limits.size_limit_bytes, limits.age_limit_s, now_s):
+                now_s, limits = time.monotonic(), profile.record
+                elapsed_s, looked_s = now_s - looked_s, now_s
+                for gone in prune(self._runs_root, limits.size_limit_bytes, limits.age_limit_s, elapsed_s):
                     self._log.say("run_removed", gone.because, run=gone.folder.name)
             if self._over.wait(_PRUNE_EVERY_S if profile is not None else 5.0):
                 return

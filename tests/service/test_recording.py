@@ -13,7 +13,7 @@ from stagectl.left_runs import finish_left_runs
 from stagectl.profile import PROFILES_FOLDER
 from stagectl.record import MANIFEST, Recorder, Recovery, read_run, recover, recover_orphans
 from stagectl.requests import Phase
-from stagectl.retention import KEEP, prune
+from stagectl.retention import AGES, KEEP, prune
 from stagectl.ring import RingWriter
 from stagectl.row import new_rows
 from stagectl.run_folder import reserve
@@ -128,7 +128,7 @@ def test_what_a_dead_service_left_is_marked_and_goes_with_the_others(tmp_path):
     ((_, recovery),) = recover_orphans(shared)
     assert recovery == Recovery(1, 0)
     living.close()
-    gone = prune(root, 0.0, 1e9, now_s=2e9)
+    gone = prune(root, 0.0, 1e9, 0.0)
     assert {one.folder for one in gone} == {*states} - {own.folder}
 
 
@@ -182,8 +182,8 @@ def made_run(root: Path, name: str, age_s: float, size_bytes: int = 1000, **mani
     with Recorder(folder, {"kept_by": "service", **manifest}):
         pass
     (folder / "truth.npz").write_bytes(b"x" * size_bytes)
-    stamp_s = 1e9 - age_s
-    os.utime(folder / MANIFEST, (stamp_s, stamp_s))
+    known = json.loads((root / AGES).read_text()) if (root / AGES).exists() else {}
+    (root / AGES).write_text(json.dumps(known | {name: age_s}))
     return folder
 
 
@@ -196,11 +196,10 @@ def test_the_oldest_go_and_what_must_stay_stays(tmp_path):
     manifest = json.loads((crashed / MANIFEST).read_text())
     manifest["record"]["state"] = "recording"
     (crashed / MANIFEST).write_text(json.dumps(manifest))
-    os.utime(crashed / MANIFEST, (0, 0))
     large = [made_run(tmp_path, f"2026-02-0{day}", (10 - day) * DAY_S, 1_000_000) for day in range(1, 5)]
     under_way = Recorder(tmp_path / "2026-01-00-now", {"kept_by": "service"})
     (tmp_path / "notes.txt").write_text("not a run")
-    removed = prune(tmp_path, 2.5e6, 30 * DAY_S, 1e9)
+    removed = prune(tmp_path, 2.5e6, 30 * DAY_S, 0.0)
     assert [gone.folder for gone in removed] == [old, large[0], large[1]]
     assert "40.0 days old, limit 30" in removed[0].because
     assert "GB, limit" in removed[1].because
@@ -208,6 +207,22 @@ def test_the_oldest_go_and_what_must_stay_stays(tmp_path):
         assert kept.exists()
     under_way.close()
     assert prune(tmp_path / "none", 1.0, 1.0, 1e9) == []
+
+
+def test_a_run_is_as_old_as_services_were_there_whatever_the_clock_says(tmp_path):
+    """Recorded in 1970 on a PC whose battery is empty, then the clock is set."""
+    run = made_run(tmp_path, "1970-01-01-a", 0.0)
+    os.utime(run / MANIFEST, (0, 0))
+    (tmp_path / AGES).unlink()
+    assert prune(tmp_path, 1e9, 30 * DAY_S, 1e9) == []  # new to this service, however long that ran before
+    assert prune(tmp_path, 1e9, 30 * DAY_S, 20 * DAY_S) == []
+    later = made_run(tmp_path, "2026-01-01-b", 0.0)
+    (gone,) = prune(tmp_path, 1e9, 30 * DAY_S, 11 * DAY_S)
+    assert gone.folder == run
+    assert "31.0 days old, limit 30" in gone.because
+    (tmp_path / AGES).write_text('{"2026-01-01-b": "of no sense"}')
+    assert prune(tmp_path, 1e9, 30 * DAY_S, 40 * DAY_S) == []
+    assert later.exists()
 
 
 @pytest.fixture
