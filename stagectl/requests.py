@@ -69,6 +69,7 @@ STATUS = np.dtype(
     [
         ("rows", "i8"),  # cycles done
         ("t_ns", "i8"),
+        ("sample_t_ns", "i8"),  # of the newest sample of the interferometer, 0 before the first one
         ("phase", "i8"),
         ("stop", "i8"),  # Stop
         ("segment_number", "i8"),  # the segment under way or done

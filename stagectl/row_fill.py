@@ -70,6 +70,7 @@ _STATED = (
 
 _MEASURED = (
     "t_ns",
+    "sample_t_ns",
     "reference_lost",
     "macro_statusword",
     "micro_statusword",

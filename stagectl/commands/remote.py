@@ -203,6 +203,9 @@ def status_table(found: messages.Status) -> Table:
         table.add_row("", escape(fault.values))
         table.add_row("[dim]what to do[/]", escape(fault.remedy))
     at = found.positions
+    if at.sample_age_s is not None and at.end_position_m is None:
+        text = f"the interferometer's newest sample is {at.sample_age_s:.1f} s old"
+        table.add_row("[dim]end[/]", f"[yellow]not known: {text}[/]")
     if at.end_position_m is not None and at.error_m is not None:
         table.add_row("[dim]end[/]", f"{at.end_position_m * 1e3:.6f} mm, error {at.error_m * 1e6:.3f} um")
     if at.macro_position_m is not None and at.relative_position_m is not None:

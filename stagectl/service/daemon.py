@@ -1,12 +1,13 @@
 """`stagectl serve`: the parts put together. The main thread is the stage's, a second one answers clients."""
 
 import gc
+import os
 import signal
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
-from stagectl.errors import RequestError
+from stagectl.errors import LinkError, RequestError
 from stagectl.left_memory import remove_left_blocks
 from stagectl.left_runs import finish_left_runs
 from stagectl.record import recover_orphans
@@ -53,7 +54,7 @@ def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
         log.say("recovered", str(outcome), run=folder.name)
     loop = StageLoop(settings, desk, log, remembered, notifier, figures)
     hear_signals(loop)
-    listener = Listener(sockets)
+    listener = Listener(sockets, ended=lambda: os.kill(os.getpid(), signal.SIGTERM))  # heard by the stage's thread
     keep_for_good()
     loop.recall_fault()
     loop.show()  # whoever asks first is answered
@@ -65,6 +66,8 @@ def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
         listener.close()
         socket_path.unlink(missing_ok=True)
         log.say("ended")
+    if listener.has_failed:
+        raise LinkError("clients were no longer answered, why stands above; the stage came to rest: start again")
 
 
 def keep_for_good() -> None:

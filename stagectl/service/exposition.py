@@ -47,16 +47,17 @@ class Figures:
         self._lateness, self._age = _Tally(LATENESS_BOUNDS_S), _Tally(AGE_BOUNDS_S)
         self._recent_s = np.zeros(_RECENT)
         self._cycles = self._missed = self._lost = self._refused = 0
-        self._last_missed = self._last_lost = 0
+        self._last_missed = self._last_lost = self._cycles_before = 0
         self._faults: Counter[str] = Counter()
         self._profile: Profile | None = None
         self._load: float | None = None
         self._load_t_ns = 0
 
     def begin_servo(self, profile: Profile | None = None) -> None:
-        """A new servo counts from 0."""
+        """A new servo counts from 0; without a profile there is none."""
         with self._lock:
             self._last_missed = self._last_lost = 0
+            self._cycles_before = self._cycles
             self._profile, self._load, self._load_t_ns = profile, None, 0
 
     def add(self, rows: np.ndarray) -> None:
@@ -99,9 +100,10 @@ class Figures:
             self._faults[kind] += 1
 
     def recent_lateness_s(self) -> tuple[float, float] | None:
-        """Return the 99th percentile and the greatest of the last 4 s at 1 kHz; None where no cycle was seen."""
+        """Return the 99th percentile and the greatest of the last 4 s at 1 kHz; None where this servo did no cycle."""
         with self._lock:
-            recent_s = self._recent_s[: min(self._cycles, _RECENT)].copy()
+            recent = np.arange(max(self._cycles_before, self._cycles - _RECENT), self._cycles)
+            recent_s = self._recent_s[recent % _RECENT]
         if recent_s.size == 0:
             return None
         return float(np.percentile(recent_s, 99)), float(recent_s.max())
@@ -131,7 +133,12 @@ class Figures:
         yield backend
         yield GaugeMetricFamily("stagectl_homed", "1 where the zeros are valid", value=float(status.homed))
         yield GaugeMetricFamily("stagectl_uptime_seconds", "Since the service began", value=status.uptime_s)
-        for name, value in status.positions.model_dump().items():
+        age_s = status.positions.sample_age_s
+        if age_s is not None:
+            yield GaugeMetricFamily(
+                "stagectl_newest_sample_age_seconds", "Of the interferometer's samples", value=age_s
+            )
+        for name, value in status.positions.model_dump(exclude={"sample_age_s"}).items():
             if value is not None:
                 yield GaugeMetricFamily(f"stagectl_{name.removesuffix('_m')}_meters", name, value=value)
         yield from _temperatures(status)

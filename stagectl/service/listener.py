@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import uvicorn
@@ -36,11 +36,19 @@ def _server(application: Application, lifespan: Literal["on", "off"]) -> uvicorn
 class Listener:
     """Serves applications on sockets until `close`."""
 
-    def __init__(self, served: Sequence[tuple[socket.socket, Application]], lifespan: Literal["on", "off"] = "off"):
+    def __init__(
+        self,
+        served: Sequence[tuple[socket.socket, Application]],
+        lifespan: Literal["on", "off"] = "off",
+        ended: Callable[[], None] = lambda: None,
+    ):
         """Take sockets that listen already; nothing is answered before `start`.
 
-        `lifespan` "on": the applications are told of their beginning and end.
+        `lifespan` "on": the applications are told of their beginning and end. `ended` is called, from the thread that
+        listens, where it stops answering without having been closed.
         """
+        self._ended, self._closing = ended, False
+        self.has_failed = False
         self._sockets = [listening for listening, _ in served]
         self._servers = [_server(application, lifespan) for _, application in served]
         self._thread = threading.Thread(target=self._work, name="api", daemon=True)
@@ -50,7 +58,12 @@ class Listener:
         self._thread.start()
 
     def _work(self) -> None:
-        asyncio.run(self._serve())
+        try:
+            asyncio.run(self._serve())
+        finally:
+            if not self._closing:
+                self.has_failed = True
+                self._ended()
 
     async def _serve(self) -> None:
         await asyncio.gather(
@@ -59,6 +72,7 @@ class Listener:
 
     def close(self) -> None:
         """Answer no more."""
+        self._closing = True
         for server in self._servers:
             server.should_exit = True
         self._thread.join(_START_S)

@@ -293,6 +293,8 @@ class Positions(BaseModel):
     relative_position_m: float | None
     setpoint_position_m: float | None
     error_m: float | None
+    sample_age_s: float | None
+    """Of the interferometer's newest sample; what it measures is null where that is older than 0.1 s."""
 
 
 class Limits(BaseModel):

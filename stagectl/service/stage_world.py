@@ -121,6 +121,7 @@ class StageWorld(StageState):
         stage, self._stage, self._wear = self._stage, None, None
         self._homed = False
         self.desk.profile = None
+        self._figures.begin_servo()
         if stage is not None:
             self._opening = False
             self._notifier.allow(_CLOSE_S)

@@ -11,6 +11,8 @@ from stagectl.profile import Profile
 from stagectl.service import messages
 from stagectl.temperatures import DriveTemperature
 
+_STALE_S = 0.1  # older than that a position is not shown; the guard's limit is far below
+
 BANNERS = {
     "hardware": "HARDWARE: what moves here is real",
     "rig": "SOFTWARE RIG: nothing real moves",
@@ -65,13 +67,18 @@ def finite(value: float) -> float | None:
 
 
 def positions(status: np.void | None) -> messages.Positions:
-    """Lay the positions of a STATUS out."""
+    """Lay the positions of a STATUS out; what the interferometer said too long ago is no position of now."""
     names = ("end_position_m", "macro_position_m", "macro_encoder_m", "setpoint_position_m", "error_m")
     found = {name: None if status is None else finite(float(status[name])) for name in names}
-    relative_m = None
+    age_s, relative_m = None, None
     if status is not None:
         relative_m = finite(float(status["end_position_m"]) - float(status["macro_position_m"]))
-    return messages.Positions(**found, relative_position_m=relative_m)
+        if status["sample_t_ns"] > 0:
+            age_s = max(int(status["t_ns"]) - int(status["sample_t_ns"]), 0) * 1e-9
+    if age_s is None or age_s > _STALE_S:
+        relative_m = None
+        found |= dict.fromkeys(("end_position_m", "macro_position_m", "error_m"))
+    return messages.Positions(**found, relative_position_m=relative_m, sample_age_s=age_s)
 
 
 def temperatures(found: Mapping[str, tuple[DriveTemperature, float]]) -> dict[str, messages.Temperature]:

@@ -44,7 +44,7 @@ STATUS = messages.Status.model_construct(
     uptime_s=1.0,
     backlash=None,
     wear=WEAR,
-    positions=messages.Positions.model_construct(),
+    positions=messages.Positions.model_construct(sample_age_s=0.25),
 )
 
 
@@ -61,6 +61,19 @@ def test_the_bus_s_load_is_what_the_profile_reckons_with_and_less_where_a_drive_
         silent.add(rows_from(first, 20, answers=False))
     assert load(silent) == pytest.approx(oled_profile.command_frames_bits * 1e3 / 1e6)
     assert load(silent) < 0.6 * load(figures)
+
+
+def test_a_servo_that_is_gone_has_no_lateness_and_no_load(oled_profile):
+    figures = Figures()
+    figures.begin_servo(oled_profile)
+    for first in range(0, 100, 20):
+        figures.add(rows_from(first, 20))
+    assert figures.recent_lateness_s() is not None
+    figures.begin_servo()
+    assert (figures.recent_lateness_s(), load(figures)) == (None, None)
+    figures.add(rows_from(0, 20))
+    assert figures.recent_lateness_s() is not None
+    assert "stagectl_newest_sample_age_seconds 0.25" in figures.exposition(STATUS).decode()
 
 
 def test_wear_is_exposed_with_age_and_alarm():

@@ -4,6 +4,7 @@ import json
 import os
 import socket
 import stat
+import threading
 import time
 
 import pytest
@@ -175,6 +176,22 @@ def crowd(tmp_path):
         yield made, desk, client
     made.close()
     listener.close()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_that_answers_no_more_is_noticed(tmp_path):
+    listening = listen_unix(tmp_path / "deaf")
+    listening.close()
+    heard = threading.Event()
+    listener = Listener([(listening, Access(None, None))], ended=heard.set)
+    listener.start()
+    assert heard.wait(10.0)
+    assert listener.has_failed
+    good = Listener([(listen_unix(tmp_path / "good"), Access(None, None))], ended=heard.clear)
+    good.start()
+    good.close()
+    assert heard.is_set()
+    assert not good.has_failed
 
 
 @pytest.mark.parametrize("asked", [b"", b"GET /v1/status HTTP/1.1\r\nHost: s\r\n"], ids=["silent", "half a request"])

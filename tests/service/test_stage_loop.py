@@ -403,6 +403,20 @@ def test_the_world_that_a_client_swapped_to_is_there_after_a_restart(tmp_path, a
     bench.loop.run()
 
 
+@pytest.mark.parametrize("kind", ["sensor_silence", "beam_loss"])
+def test_a_position_that_is_old_is_not_known(bench, kind):
+    bench.until(lambda: bench.status.positions.end_position_m is not None)
+    assert bench.status.positions.sample_age_s < 0.01
+    where = {"axis": "both"} if kind == "beam_loss" else {}
+    bench.inject(Fault(kind, duration_s=0.5, **where))
+    bench.until(lambda: bench.status.positions.end_position_m is None)
+    at = bench.status.positions
+    assert (at.macro_position_m, at.relative_position_m, at.error_m) == (None, None, None)
+    assert at.sample_age_s > 0.1
+    assert at.macro_encoder_m is not None
+    bench.until(lambda: bench.status.positions.end_position_m is not None)
+
+
 def test_the_joint_of_one_world_is_not_shown_in_another_and_keeps_the_date_it_was_seen_at(tmp_path):
     rigs = messages.Backlash(
         width_m=2e-4, centre_m=0.0, left_m=1e-4, right_m=1e-4, left_stiffness_n_per_m=1e4,

@@ -151,8 +151,11 @@ function showStatus(status) {
   operator.update(status);
   write('doing', meaning(operator.situation));
   byId('doing').dataset.homed = status.homed;
-  write('remarks', status.remarks.join('\n'));
-  byId('remarks').hidden = status.remarks.length === 0;
+  const { end_position_m: end, sample_age_s: age } = status.positions;
+  const stale = end === null && age !== null ? [`positions are not known: the interferometer's newest sample is ${age.toFixed(1)} s old`] : [];
+  const remarks = [...stale, ...status.remarks];
+  write('remarks', remarks.join('\n'));
+  byId('remarks').hidden = remarks.length === 0;
   if (status.state !== lastState) {
     if (['moving', 'identifying', 'armed'].includes(lastState)) setTimeout(showRuns, 1500);
     lastState = status.state;
