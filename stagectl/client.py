@@ -15,7 +15,16 @@ from typing import Any, TypeVar
 import httpx
 from pydantic import BaseModel, TypeAdapter
 
-from stagectl.errors import DriveError, LinkError, ProfileError, RecordError, RequestError, StagectlError, TimingError
+from stagectl.errors import (
+    DriveError,
+    JogOver,
+    LinkError,
+    ProfileError,
+    RecordError,
+    RequestError,
+    StagectlError,
+    TimingError,
+)
 from stagectl.service import messages
 from stagectl.service.places import default_socket
 
@@ -26,7 +35,10 @@ _BLOCK_COUNT = 50
 _STOP_TRIES = 3
 _REST_S, _LOOK_S = 30.0, 0.05
 _WITHOUT_POWER = ("off", "idle", "fault")
-_KINDS = {kind.__name__: kind for kind in (DriveError, LinkError, ProfileError, RecordError, RequestError, TimingError)}
+_KINDS = {
+    kind.__name__: kind
+    for kind in (DriveError, JogOver, LinkError, ProfileError, RecordError, RequestError, TimingError)
+}
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
@@ -182,10 +194,14 @@ class Client:
         """Work in another world; without power only."""
         return self.do("backend", messages.SwapBackend.model_validate({"backend": backend}))
 
-    def jog_at(self, velocity_m_per_s: float, hold_s: float = 0.3) -> messages.Command:
-        """Jog at a velocity; to be said again before `hold_s` is over."""
+    def begin_jog(self, hold_s: float = 0.3) -> messages.Command:
+        """Begin to jog, at rest; `jog_at` with the answer's key says how fast, before `hold_s` is over."""
+        return self.begin("jogging", messages.BeginJog(hold_s=hold_s))
+
+    def jog_at(self, key: str, velocity_m_per_s: float, hold_s: float = 0.3) -> messages.Command:
+        """Jog at a velocity; to be said again before `hold_s` is over. JogOver where it was not: begin a new one."""
         body = messages.JogAt(velocity_m_per_s=velocity_m_per_s, hold_s=hold_s)
-        return messages.Command.model_validate(self._ask("PUT", "/v1/jog", body))
+        return messages.Command.model_validate(self._ask("PUT", f"/v1/jogging/{key}", body))
 
     def scan(self, program: messages.Scan) -> messages.Command:
         """Follow a scan program and wait for its end."""

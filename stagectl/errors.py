@@ -36,5 +36,9 @@ class RequestError(StagectlError):
     """The request can't be carried out on this machine in this state."""
 
 
+class JogOver(RequestError):
+    """The jog that a request wants to go on with is over; a new one has to be begun."""
+
+
 class RecordError(StagectlError):
     """A run folder can't be written or read."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from stagectl.client import Client
 from stagectl.commands.answer import Answer, Voice
 from stagectl.commands.remote import connected, follow, leased
-from stagectl.errors import RequestError
+from stagectl.errors import JogOver, RequestError
 from stagectl.service import messages
 
 FIRST_HOLD_S = 0.6
@@ -79,7 +79,7 @@ def jog(voice: Voice, socket: Path | None, token: str | None, speed_m_per_s: flo
 
 
 def _follow_keys(voice: Voice, stage: Client, hand: Hand, fileno: int) -> None:
-    was_moving = False
+    key, was_moving = "", False
     while not hand.leaves:
         voice.check()
         if select.select([fileno], [], [], _STEP_S)[0]:
@@ -88,9 +88,19 @@ def _follow_keys(voice: Voice, stage: Client, hand: Hand, fileno: int) -> None:
                 return
             hand.press(keys, time.monotonic())
         wanted = hand.wanted_m_per_s(time.monotonic())
-        if wanted != 0.0 or was_moving:
-            stage.jog_at(wanted, hold_s=0.3)
+        if wanted != 0.0 and not key:
+            key = stage.begin_jog().key  # which may take its time: what the keys want is looked at again
+        elif wanted != 0.0 or was_moving:
+            key = _gone_on(stage, key, wanted)
         was_moving = wanted != 0.0
+
+
+def _gone_on(stage: Client, key: str, wanted_m_per_s: float) -> str:
+    """Go on with a jog; returns its key, empty where it is over."""
+    try:
+        return stage.jog_at(key, wanted_m_per_s).key
+    except JogOver:
+        return ""
 
 
 @contextmanager

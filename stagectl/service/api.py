@@ -219,10 +219,17 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
         """Send set-points ahead; number 0 begins. Where none comes in time the stage brakes and holds."""
         return desk.take_setpoints(body, token)
 
-    @app.put("/v1/jog", status_code=202, dependencies=_OPERATES)
-    async def jog_at(body: messages.JogAt, token: LeaseToken = "") -> messages.Command:
-        """Jog at a velocity; say it again before `hold_s` is over, or the stage comes to rest."""
-        return desk.jog_at(body, token)
+    @app.post("/v1/jogging", status_code=202, dependencies=_OPERATES)
+    async def begin_jog(
+        body: messages.BeginJog, key: IdempotencyKey = None, token: LeaseToken = ""
+    ) -> messages.Command:
+        """Begin to jog, at rest; the answer's key is what the velocities are said to."""
+        return desk.begin_jog(body, key or f"jog-{secrets.token_hex(8)}", token)
+
+    @app.put("/v1/jogging/{key}", status_code=202, dependencies=_OPERATES)
+    async def jog_at(key: messages.Key, body: messages.JogAt, token: LeaseToken = "") -> messages.Command:
+        """Jog at a velocity; say it again before `hold_s` is over, or that jog ends for good (409)."""
+        return desk.jog_at(key, body, token)
 
     @app.post("/v1/stop", status_code=202, dependencies=_OPERATES)
     async def stop() -> messages.Status:

@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from stagectl.errors import RequestError, StagectlError
+from stagectl.errors import JogOver, RequestError, StagectlError
 from stagectl.profile import Profile
 from stagectl.service import lease as leases
 from stagectl.service import messages, plans, states
@@ -385,8 +385,8 @@ class Desk:
                 states.after(self._state, MOTIONS[name].event)
             self._check_values(name, body)
             order = Order(key, name, body, token, self._clock_s, plan)
-            if name == "jog_at":
-                order.hold(body.velocity_m_per_s, body.hold_s)
+            if name == "jogging":
+                order.hold(0.0, body.hold_s)
             self._keep_order(order)
             return order.message()
 
@@ -396,18 +396,32 @@ class Desk:
             if self._lease is not None:
                 self.submit(name, body, f"own-{secrets.token_hex(8)}", self._lease.token)
 
-    def jog_at(self, body: messages.JogAt, token: str) -> messages.Command:
-        """Begin to jog, or go on at this velocity. Errors: RequestError and kinds."""
+    def begin_jog(self, body: messages.BeginJog, key: str, token: str) -> messages.Command:
+        """Begin to jog, at rest, or brake the jog under way to go on with that. Errors: RequestError and kinds."""
+        with self._lock:
+            order = self._current
+            if key in self._orders or order is None or order.name != "jogging" or order.over:
+                return self.submit("jogging", body, key, token)
+            leases.holds(self._lease, token, self._clock_s())
+            self._refuse_when_stopping("jogging")
+            order.hold(0.0, body.hold_s)
+            return order.message()
+
+    def jog_at(self, key: str, body: messages.JogAt, token: str) -> messages.Command:
+        """Go on with the jog of that key at a velocity; one let go of stays so. Errors: RequestError and kinds.
+
+        A request that was held up on its way begins nothing: whoever sent it may have let go of the key since.
+        """
         with self._lock:
             leases.holds(self._lease, token, self._clock_s())
+            self._refuse_when_stopping("jogging")
             order = self._current
-            if order is not None and order.name == "jog_at" and not order.over:
-                if self._stop.is_set():
-                    raise Busy("the stage is coming to rest; wait until it stands")
-                self._check_values("jog_at", body)
-                order.hold(body.velocity_m_per_s, body.hold_s)
-                return order.message()
-            return self.submit("jog_at", body, f"jog-{secrets.token_hex(8)}", token)
+            under_way = order is not None and order.key == key and order.name == "jogging" and not order.over
+            if order is None or not under_way or order.wanted_m_per_s() is None:
+                raise JogOver(f"the jog {key} is over: nothing was said in time, or it came to an end; begin a new one")
+            self._check_values("jog_at", body)
+            order.hold(body.velocity_m_per_s, body.hold_s)
+            return order.message()
 
     def command(self, key: str) -> messages.Command | None:
         """Return what became of a command; None where no such key was seen."""
@@ -426,9 +440,12 @@ class Desk:
         if self._closed:
             raise Ending("the service is ending; try again when it is back")
 
-    def _refuse_when_busy(self, name: str) -> None:
+    def _refuse_when_stopping(self, name: str) -> None:
         if self._stop.is_set():
             raise Busy(f"{name}: the stage is coming to rest; wait until it stands")
+
+    def _refuse_when_busy(self, name: str) -> None:
+        self._refuse_when_stopping(name)
         if self._current is not None and not self._current.over:
             raise Busy(f"{name}: {self._current.name} is under way; wait for its end, or stop it")
 

@@ -47,8 +47,14 @@ class JogBy(_Asked):
     law: LawName | None = None
 
 
+class BeginJog(_Asked):
+    """Begin to jog, at rest; how fast is said next, before `hold_s` is over."""
+
+    hold_s: Annotated[Finite, Field(ge=0.05, le=1.0)] = 0.3
+
+
 class JogAt(_Asked):
-    """Move at a velocity for as long as this is said again before `hold_s` is over; 0 holds still."""
+    """Go on with a jog at a velocity, for as long as this is said again before `hold_s` is over; 0 holds still."""
 
     velocity_m_per_s: Annotated[Finite, Field(ge=-20.0, le=20.0)]
     hold_s: Annotated[Finite, Field(ge=0.05, le=1.0)] = 0.3

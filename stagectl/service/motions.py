@@ -29,7 +29,7 @@ MOTIONS: dict[str, Motion] = {
     "home": Motion(Event.HOME, lambda stage, order: stage.home(), needs_homing=False, identifies=True),
     "move": Motion(Event.MOVE, lambda stage, order: stage.move(order.body.target_m, order.body.law)),
     "jog": Motion(Event.MOVE, _by_distance),
-    "jog_at": Motion(Event.MOVE, lambda stage, order: stage.jog(order.wanted_m_per_s)),
+    "jogging": Motion(Event.MOVE, lambda stage, order: stage.jog(order.wanted_m_per_s)),
     "scan": Motion(Event.MOVE, lambda stage, order: stage.scan(order.plan, order.body.law)),
     "follow": Motion(Event.MOVE, lambda stage, order: stage.run(order.plan, order.body.law)),
     "setpoints": Motion(Event.MOVE, lambda stage, order: stage.follow_stream(order.plan)),

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from stagectl.backend import ask_rig
 from stagectl.client import Client
-from stagectl.errors import LinkError, StagectlError
+from stagectl.errors import JogOver, LinkError, StagectlError
 from tests.service.daemon import PATIENT, Daemon
 
 CHANGES = {**PATIENT, "record": {"when": "always"}}
@@ -102,13 +102,17 @@ class House:
 
     def _operate(self, over: threading.Event) -> None:
         """Renew the lease, and hold the key while jogging, as an operator's program does."""
+        jog = ""
         with Client(self.daemon.socket) as client:
             client.lease_token = self.daemon.client.lease_token
             while not over.wait(0.1):
                 try:
                     client.renew_lease()
                     if self._jogging.is_set():
-                        client.jog_at(self._speed_m_per_s, 0.5)
+                        jog = jog or client.begin_jog(0.5).key
+                        client.jog_at(jog, self._speed_m_per_s, 0.5)
+                except JogOver:
+                    jog = ""
                 except LinkError:
                     continue
                 except StagectlError:

@@ -11,7 +11,7 @@ import numpy as np
 from sim_backend.machine import load_machine
 from stagectl import stage as stages
 from stagectl.backend import BatchBackend, ServoLink
-from stagectl.errors import LinkError, RequestError
+from stagectl.errors import JogOver, LinkError, RequestError
 from stagectl.profile import PROFILES_FOLDER
 from stagectl.service import messages
 from stagectl.service.desk import Desk
@@ -86,6 +86,7 @@ class Scene:
         self._there = True  # the operator's program runs
         self._renewed_t_ns = self._pressed_t_ns = 0
         self._jog_m_per_s: float | None = None
+        self._jog_key = ""
         self._due: Any = None  # says whether the fault is due
         self._fastest_m_per_s = 0.0
         self._filler: Path | None = None
@@ -198,10 +199,17 @@ class Scene:
                 self.desk.renew_lease(self._token)
             if self._jog_m_per_s is not None and self.t_ns - self._pressed_t_ns > _PRESS_NS:
                 self._pressed_t_ns = self.t_ns
-                self.desk.jog_at(self._jog_body(), self._token)
+                self._press()
 
-    def _jog_body(self) -> messages.JogAt:
-        return messages.JogAt(velocity_m_per_s=self._jog_m_per_s or 0.0, hold_s=0.3)
+    def _press(self) -> None:
+        """Say the jog's velocity; begin one where none is under way."""
+        body = messages.JogAt(velocity_m_per_s=self._jog_m_per_s or 0.0, hold_s=0.3)
+        try:
+            self.desk.jog_at(self._jog_key, body, self._token)
+        except JogOver:
+            key = f"jog-{self.t_ns}"
+            self._jog_key = self.desk.begin_jog(messages.BeginJog(), key, self._token).key
+            self.desk.jog_at(self._jog_key, body, self._token)
 
     def _take_lease(self) -> bool:
         """Hold the lease, once nobody else does and the stage is at rest."""
@@ -287,7 +295,9 @@ class Scene:
         for token in tokens:
             for name, body in asked.items():
                 self._forbidden(name, lambda: self.desk.submit(name, body, f"bert-{rng.integers(10**9)}", token))  # noqa: B023
-            self._forbidden("jog_at", lambda: self.desk.jog_at(messages.JogAt(velocity_m_per_s=0.1), token))  # noqa: B023
+            velocity = messages.JogAt(velocity_m_per_s=0.1)
+            self._forbidden("jog_at", lambda: self.desk.jog_at(self._jog_key, velocity, token))  # noqa: B023
+            self._forbidden("begin_jog", lambda: self.desk.begin_jog(messages.BeginJog(), "bert-jogs", token))  # noqa: B023
             self._forbidden("renew", lambda: self.desk.renew_lease(token))  # noqa: B023
             self._forbidden("give back", lambda: self.desk.give_lease_back(token))  # noqa: B023
         self._forbidden("take", lambda: self.desk.take_lease(messages.TakeLease(holder="bert")))
@@ -352,7 +362,7 @@ class Scene:
         self._due = lambda: self.t_ns >= due_t_ns
         if phase == "jogging":
             self._jog_m_per_s = sign * float(rng.uniform(0.05, 0.3))
-            self.desk.jog_at(self._jog_body(), self._token)
+            self._press()
         elif phase == "identifying":
             self.begin("identify", messages.Identify(duration_s=4.0))
         elif phase == "homing":

@@ -52,8 +52,9 @@ def test_a_client_homes_moves_and_jogs(idle):
         )  # the rig's zero is its own
         before_m = client.status().positions.end_position_m
         until_s = time.monotonic() + 1.5
+        command = client.begin_jog()
         while time.monotonic() < until_s:
-            command = client.jog_at(0.02, hold_s=0.5)
+            client.jog_at(command.key, 0.02, hold_s=0.5)
             time.sleep(0.1)
         assert client.command(command.key, 5.0).stop == "FINISHED"  # the key was let go of
         after_m = client.status().positions.end_position_m
@@ -109,7 +110,7 @@ HOSTILE = [
     ("POST", "/v1/move", b"[" * 10_000, 400),
     ("POST", "/v1/move", b"\xff\xfe", 422),
     ("POST", "/v1/move", b'{"target_m": 0.1}' + b" " * 100_000, 413),
-    ("PUT", "/v1/jog", b'{"velocity_m_per_s": 0.1, "hold_s": 1e9}', 422),
+    ("PUT", "/v1/jogging/jog-1", b'{"velocity_m_per_s": 0.1, "hold_s": 1e9}', 422),
     ("POST", "/v1/backend", b'{"backend": "plant"}', 422),
     ("POST", "/v1/lease", b'{"holder": "a\\u0000b"}', 422),
     ("GET", "/v1/commands/%2e%2e%2fstatus", b"", 404),

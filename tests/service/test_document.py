@@ -72,7 +72,7 @@ def test_no_request_without_a_lease_moves_or_breaks_anything(served, mode):
             once()
         except Unsatisfiable:  # no data can be wrong where there is none to give
             assert mode is GenerationMode.NEGATIVE
-    assert {"POST /v1/move", "PUT /v1/jog", "POST /v1/lease"} <= tried
+    assert {"POST /v1/move", "PUT /v1/jogging/{key}", "POST /v1/lease"} <= tried
     for _ in range(3):
         bench.loop.step()
     assert bench.status.state == "idle"

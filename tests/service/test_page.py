@@ -118,7 +118,7 @@ def test_an_observer_commands_nothing(page, daemon):
             answer = browser.post(f"/v1/{name}", json=body)
             assert answer.status_code == 403
             assert "may only watch" in answer.json()["message"]
-        assert browser.put("/v1/jog", json={"velocity_m_per_s": 0.01}).status_code == 403
+        assert browser.put("/v1/jogging/jog-1", json={"velocity_m_per_s": 0.01}).status_code == 403
         assert browser.delete("/v1/record").status_code == 403
         assert browser.request("PATCH", "/v1/status").status_code == 403
     assert daemon.client.lease_state() is None
@@ -220,7 +220,7 @@ def test_a_stolen_cookie_commands_nothing(page, idle):
         own = browser.headers[KEY_HEADER]
         for key in ("", "guess", other.headers[KEY_HEADER], own[:-1]):
             browser.headers[KEY_HEADER] = key
-            for method, place in (("POST", "lease"), ("POST", "stop"), ("PUT", "jog"), ("DELETE", "record")):
+            for method, place in (("POST", "lease"), ("POST", "stop"), ("PUT", "jogging/jog-1"), ("DELETE", "record")):
                 answer = browser.request(method, f"/v1/{place}", json={"holder": "thief"})
                 assert answer.status_code == 403
                 assert "key" in answer.json()["message"]

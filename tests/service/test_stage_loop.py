@@ -6,7 +6,7 @@ import pytest
 
 from drivers import cia402
 from sim_backend.faults import Fault
-from stagectl.errors import RequestError
+from stagectl.errors import JogOver, RequestError
 from stagectl.outcome import BacklashEstimate
 from stagectl.profile import PROFILES_FOLDER
 from stagectl.requests import Mode
@@ -115,7 +115,9 @@ def test_nothing_moves_without_a_lease(bench):
         with pytest.raises(LeaseRefused):
             bench.desk.submit(name, body, "k", "guessed")
     with pytest.raises(LeaseRefused):
-        bench.desk.jog_at(messages.JogAt(velocity_m_per_s=0.1), "guessed")
+        bench.desk.begin_jog(messages.BeginJog(), "k", "guessed")
+    with pytest.raises(LeaseRefused):
+        bench.desk.jog_at("k", messages.JogAt(velocity_m_per_s=0.1), "guessed")
     bench.loop.step()
     assert bench.status.state == "idle"
 
@@ -256,8 +258,52 @@ def test_a_stop_takes_the_power_from_a_stage_with_a_fault_and_acknowledges_nothi
     assert (armed.status.state, armed.status.fault.number) == ("fault", number)
 
 
+def test_what_is_said_to_a_jog_that_was_let_go_of_moves_nothing(armed):
+    desk, token = armed.desk, armed.token
+    velocity = messages.JogAt(velocity_m_per_s=0.05)
+    first = desk.begin_jog(messages.BeginJog(), "first", token).key
+    desk.jog_at(first, velocity, token)
+    from_m, refused = float(armed.loop._stage.status()["setpoint_position_m"]), []
+    before = armed.loop._stage._progress
+
+    def late_requests(what, share):
+        before(what, share)
+        if refused or armed.loop._stage.status()["setpoint_position_m"] > from_m + 2e-3:
+            armed.now_s += 0.0 if refused else 0.31  # the hold is over: it brakes
+            with pytest.raises(JogOver, match="the jog first is over") as caught:
+                desk.jog_at(first, velocity, token)
+            refused.append(caught)
+
+    armed.loop._stage._progress = late_requests
+    armed.until(lambda: desk.command(first).state == "done")
+    armed.loop._stage._progress = before
+    assert len(refused) > 2
+    armed.loop.step()
+    at_m = armed.loop._stage.status()["setpoint_position_m"]
+    with pytest.raises(JogOver):
+        desk.jog_at(first, velocity, token)
+    assert desk.begin_jog(messages.BeginJog(), "first", token).state == "done"  # said twice, carried out once
+    second = desk.begin_jog(messages.BeginJog(), "second", token).key  # a late one: begins at rest, and nothing follows
+    with pytest.raises(JogOver, match="the jog first is over"):
+        desk.jog_at(first, velocity, token)
+    armed.now_s += 0.31
+    armed.until(lambda: desk.command(second).state == "done")
+    assert armed.loop._stage.status()["setpoint_position_m"] == at_m
+
+
+def test_a_key_pressed_again_while_the_jog_brakes_goes_on_with_it(armed):
+    desk, token = armed.desk, armed.token
+    key = desk.begin_jog(messages.BeginJog(), "pressed", token).key
+    armed.now_s += 0.31
+    assert desk.begin_jog(messages.BeginJog(), "again", token).key == key
+    assert desk.jog_at(key, messages.JogAt(velocity_m_per_s=0.01), token).key == key
+    armed.now_s += 0.31
+    armed.until(lambda: desk.command(key).state == "done")
+
+
 def test_a_stop_in_the_last_moment_of_a_jog_is_a_stop(armed):
-    key = armed.desk.jog_at(messages.JogAt(velocity_m_per_s=0.01, hold_s=0.3), armed.token).key
+    key = armed.desk.begin_jog(messages.BeginJog(), "last", armed.token).key
+    armed.desk.jog_at(key, messages.JogAt(velocity_m_per_s=0.01), armed.token)
     order = armed.desk._orders[key]
     before = order.wanted_m_per_s
 

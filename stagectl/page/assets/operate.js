@@ -50,7 +50,7 @@ export class Operator {
       throw new Error('The page\'s process doesn\'t answer; is `stagectl page` still running?');
     }
     const found = answer.status === 204 ? null : await answer.json().catch(() => null);
-    if (!answer.ok) throw Object.assign(new Error(found?.message ?? `answered ${answer.status}`), { code: answer.status });
+    if (!answer.ok) throw Object.assign(new Error(found?.message ?? `answered ${answer.status}`), { code: answer.status, kind: found?.kind });
     return found;
   }
 
@@ -100,7 +100,8 @@ export class Operator {
     this.token = '';
   }
 
-  // ---- jog: said again and again while it is held; the service lets go by itself when it isn't ----
+  // ---- jog: said again and again while it is held; the service lets go by itself when it isn't, and what comes late
+  // begins nothing: a jog begins at rest, and a velocity counts only in the jog that it was said to ----
 
   speed_m_per_s() {
     const most = this.status?.limits?.jog_velocity_m_per_s ?? 0.1;
@@ -114,18 +115,31 @@ export class Operator {
     if (this.jogging) return;
     this.jogging = true;
     this.refuse('');
+    let begun = '';
     try {
       while (this.jog !== 0) {
-        await this.ask('PUT', 'jog', { velocity_m_per_s: this.jog * this.speed_m_per_s(), hold_s: JOG_HOLD_S });
+        begun ||= (await this.ask('POST', 'jogging', { hold_s: JOG_HOLD_S })).key;
+        if (this.jog !== 0 && !await this.goOn(begun, this.jog * this.speed_m_per_s())) begun = '';
         await sleep(JOG_AGAIN_MS);
       }
-      await this.ask('PUT', 'jog', { velocity_m_per_s: 0, hold_s: 0.05 });
+      if (begun) await this.goOn(begun, 0);
     } catch (error) {
       if (this.jog !== 0) this.refuse(error.message);
       this.jog = 0;
     } finally {
       this.jogging = false;
       this.showJog();
+    }
+  }
+
+  // Whether that jog is still under way.
+  async goOn(begun, velocity_m_per_s) {
+    try {
+      await this.ask('PUT', `jogging/${begun}`, { velocity_m_per_s, hold_s: velocity_m_per_s === 0 ? 0.05 : JOG_HOLD_S });
+      return true;
+    } catch (error) {
+      if (error.kind === 'JogOver') return false;
+      throw error;
     }
   }
 
@@ -226,7 +240,7 @@ export class Operator {
     const finished = command.stop === 'FINISHED';
     const end = { waiting: 'waits', running: '', done: finished || !command.stop ? 'done' : `ended by ${command.stop}`, failed: 'failed' }[command.state];
     const text = finished ? this.found(command.backlash) : command.text;
-    byId('command-text').textContent = [command.name.replace('_at', ''), end, text].filter(Boolean).join(': ');
+    byId('command-text').textContent = [command.name, end, text].filter(Boolean).join(': ');
     byId('command').dataset.state = command.state;
     byId('command-share').hidden = command.state !== 'running';
     if (command.share > 0) byId('command-share').value = command.share; else byId('command-share').removeAttribute('value');
