@@ -242,6 +242,7 @@ def _temperature(axis: str, one: messages.Temperature) -> str:
 def log(voice: Voice, socket: Path | None, lines_count: int) -> Answer:
     """Show what the service did last."""
     with connected(socket) as stage:
+        voice.note(stage.status().banner)
         entries = stage.log(limit=lines_count)
     shown = [escape(f"{entry.at}  {entry.event:<15} {entry.text}") for entry in entries]
     return Answer({"entries": [entry.model_dump() for entry in entries]}, shown)
@@ -258,12 +259,14 @@ def stop(voice: Voice, socket: Path | None) -> Answer:
             voice.progress("coming to rest", 0.0)
             found = stage.status()
     voice.progress.done()
+    voice.note(found.banner)
     return Answer({"state": found.state}, [f"stopped; the state is {found.state}"])
 
 
 def fault(voice: Voice, socket: Path | None, token: str | None, acknowledge: bool) -> Answer:
     """Show the fault, or take note of it."""
     with connected(socket) as stage:
+        voice.note(stage.status().banner)
         found = stage.fault()
         if found is None:
             return Answer({"fault": None, "acknowledged": False}, ["no fault"])
@@ -283,6 +286,7 @@ def fault(voice: Voice, socket: Path | None, token: str | None, acknowledge: boo
 def lease(voice: Voice, socket: Path | None, hold: bool) -> Answer:
     """Show who holds the lease, or hold it until Ctrl-C."""
     with connected(socket) as stage:
+        voice.note(stage.status().banner)
         if not hold:
             held = stage.lease_state()
             text = "free" if held is None else f"{held.holder}, {held.left_s:.1f} s left"
@@ -308,7 +312,9 @@ def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> An
             else:
                 stage.record(checked("StartRecord", name=name).name)  # pyright: ignore[reportAttributeAccessIssue]
             time.sleep(_POLL_S)
-        found = stage.status().recording
+        status = stage.status()
+    voice.note(status.banner)
+    found = status.recording
     text = "nothing: the stage is not connected"
     if found is not None:
         text = f"{found.run}, begun by {found.trigger}" if found.run else "the last seconds only, in memory"
@@ -327,7 +333,9 @@ def trigger(voice: Voice, socket: Path | None, body: dict | None, reversal: bool
             stage.set_trigger(messages.SetTrigger.model_validate(checked("SetTrigger", **body).model_dump()))
         if end or body is not None:
             time.sleep(_POLL_S)
-        found = stage.status().recording
+        status = stage.status()
+    voice.note(status.banner)
+    found = status.recording
     waits_for = "" if found is None else found.waits_for
     return Answer({"waits_for": waits_for}, [f"waits for {waits_for}" if waits_for else "waits for no event"])
 

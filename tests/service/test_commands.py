@@ -132,6 +132,26 @@ def test_the_rest_says_what_it_found(call):
     assert len(answer["entries"]) == 5
 
 
+@pytest.mark.parametrize("command", ["status", "stop", "fault", "lease", "backend", "log", "record", "trigger"])
+def test_every_command_says_which_world_it_is(idle, capsys, monkeypatch, command):
+    monkeypatch.setenv("STAGECTL_SOCKET", str(idle.socket))
+    assert cli.main([command]) == 0
+    said = capsys.readouterr()
+    assert "SOFTWARE RIG: nothing real moves" in said.out + said.err
+
+
+def test_a_run_and_an_event_are_recorded_by_command(call):
+    code, answer = call("record", "--name", "warm-up")
+    assert (code, answer["recording"]["trigger"]) == (0, "request")
+    assert "warm-up" in answer["recording"]["run"]
+    code, answer = call("record", "--end")
+    assert (code, answer["recording"]["run"]) == (0, "")
+    code, answer = call("trigger", "--reversal", "--count", 2)
+    assert (code, answer["waits_for"]) == (0, "reversal, 2 times")
+    code, answer = call("trigger", "--end")
+    assert (code, answer["waits_for"]) == (0, "")
+
+
 def test_without_a_service_there_is_nothing_to_ask(call, monkeypatch, tmp_path):
     monkeypatch.setenv("STAGECTL_SOCKET", str(tmp_path / "none"))
     for command in (["status"], ["stop"], ["fault"], ["lease"], ["backend"], ["log"], ["watch"]):
