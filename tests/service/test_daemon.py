@@ -52,7 +52,7 @@ def test_a_client_homes_moves_and_jogs(idle):
         )  # the rig's zero is its own
         before_m = client.status().positions.end_position_m
         until_s = time.monotonic() + 1.5
-        command = client.begin_jog()
+        command = client.begin_jog(hold_s=0.5)
         while time.monotonic() < until_s:
             client.jog_at(command.key, 0.02, hold_s=0.5)
             time.sleep(0.1)

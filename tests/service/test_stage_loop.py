@@ -291,16 +291,6 @@ def test_what_is_said_to_a_jog_that_was_let_go_of_moves_nothing(armed):
     assert armed.loop._stage.status()["setpoint_position_m"] == at_m
 
 
-def test_a_key_pressed_again_while_the_jog_brakes_goes_on_with_it(armed):
-    desk, token = armed.desk, armed.token
-    key = desk.begin_jog(messages.BeginJog(), "pressed", token).key
-    armed.now_s += 0.31
-    assert desk.begin_jog(messages.BeginJog(), "again", token).key == key
-    assert desk.jog_at(key, messages.JogAt(velocity_m_per_s=0.01), token).key == key
-    armed.now_s += 0.31
-    armed.until(lambda: desk.command(key).state == "done")
-
-
 def test_a_stop_in_the_last_moment_of_a_jog_is_a_stop(armed):
     key = armed.desk.begin_jog(messages.BeginJog(), "last", armed.token).key
     armed.desk.jog_at(key, messages.JogAt(velocity_m_per_s=0.01), armed.token)
