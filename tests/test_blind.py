@@ -571,6 +571,16 @@ def test_marks(found, truth, where, right):
     assert mark["right"] is right
 
 
+@pytest.mark.parametrize(("acts_on", "count"), [("macro_force", 1), ("micro_force", 0)])
+def test_a_member_of_a_set_has_no_amplitude_of_the_true_one(acts_on, count):
+    truth = true_set(inseparable=[["coulomb_friction", "micro_force"]])
+    found = findings("coulomb_friction", aliases=[["coulomb_friction", "macro_force"]])
+    found["effects"][0] |= {"acts_on": acts_on, "parameters": {"level_n": -2.0}, "interval": {"level_n": [-2.1, -1.9]}}
+    mark = score.score(found, truth)
+    assert mark["right"] is True
+    assert len(score.parameter_marks(mark["pairs"])) == count
+
+
 def test_clopper_pearson_by_its_definition():
     """At each end of the interval, the count seen or a more extreme one has a probability of 2.5 %."""
 

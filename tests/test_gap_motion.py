@@ -140,6 +140,15 @@ def test_what_is_known_as_a_ratio_may_be_wrong_by_a_large_one(touching):
     assert set(reach) == {*damps, *sides, *bodies, "spring_n_per_m"}
 
 
+def test_a_damping_that_was_found_lets_go_where_one_that_is_believed_does(touching):
+    undamped = balance.recording_of(touching.log, dataclasses.replace(STAGE, effects=()))
+    known = operating_point(undamped, [(CATALOGUE["contact_damping"], "contact", {"damping_n_s_per_m": 90.0})])
+    assert np.sum(known.side != undamped.side) > 4  # a damped contact lets go before it is unloaded
+    assert np.array_equal(known.side, touching.side)
+    for name in ("macro_n", "end_n"):
+        assert getattr(known_forces(known), name) == pytest.approx(getattr(known_forces(touching), name), abs=1e-9)
+
+
 def test_edges_that_wear_lie_further_out_at_every_instant(touching):
     """At 10 um/s and edge, the last swing of four seconds is 35 um less deep than the first, which has lost 1.25 um."""
     there = operating_point(touching, [(CATALOGUE["backlash_wear"], "contact_edge", {"rate_m_per_s": 20e-6})])
@@ -158,7 +167,7 @@ def test_an_edge_is_passed_at_its_own_instant(rate_m_per_s):
     fine_s = np.linspace(-20.0 * part_s, 20.0 * part_s, 400_001)
     for passed_s in part_s * np.linspace(0.0, 1.0, 9):
         x_b = JOINT.right_m + rate_m_per_s * (middles_s - passed_s)
-        push_n = contact_at(STAGE, JOINT, x_b, np.full_like(x_b, rate_m_per_s)).push_n(JOINT, 90.0)
+        push_n = contact_at(JOINT, 90.0, x_b, np.full_like(x_b, rate_m_per_s), part_s).push_n(JOINT, 90.0)
         depth_m = rate_m_per_s * (fine_s - passed_s)
         exact_n = np.maximum(JOINT.right_stiffness_n_per_m * depth_m + 90.0 * rate_m_per_s, 0.0) * (depth_m > 0.0)
         assert np.min(push_n) >= 0.0

@@ -28,17 +28,17 @@ _LOOSE_N = 1e3
 def recording_of(
     log: Log,
     believed: Believed,
-    on_command: tuple[Row, ...] = (),
+    at_size: tuple[Row, ...] = (),
     late: tuple[Row, ...] = (),
     edges_out_m: EdgesOut = (0.0, 0.0),
 ) -> Recording:
     """Prepare a log: motion, commands on parts of intervals, contact geometry.
 
-    on_command, late, edges_out_m: effects of the command path, of readings that are late, and what has become of the
-    edges, beside what is believed.
+    at_size, late, edges_out_m: effects of command path and contact, of readings that are late, and what has become of
+    the edges, beside what is believed.
     """
     macro = motion_of(log.macro_position_m, log.period_s, believed.macro.noise_m)
-    rough = put_together(log, believed, macro, None, on_command, late, edges_out_m)
+    rough = put_together(log, believed, macro, None, at_size, late, edges_out_m)
     return foretold_under(rough, known_forces(rough))
 
 
@@ -59,7 +59,7 @@ def foretold_under(recording: Recording, forces: Forces, found: Forces | None = 
             )  # fmt: skip
     there = put_together(
         log, believed, motions[0] or recording.macro, motions[1],
-        recording.on_command, recording.late, recording.edges_out_m,
+        recording.at_size, recording.late, recording.edges_out_m,
     )  # fmt: skip
     there.found = recording.found if found is None else found
     return there

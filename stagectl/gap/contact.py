@@ -1,11 +1,13 @@
 """The believed contact of the joint: where its parts overlap along a motion, and how they push each other. Pure."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from stagectl.compiled import compiled
-from stagectl.gap.believed import Believed, BelievedJoint
+from stagectl.gap.believed import BelievedJoint
 
 CONTACT_DAMPING = "contact_damping"
 """The effect of the library that decides about where a contact lets go."""
@@ -32,10 +34,11 @@ class Contact:
 
 
 def contact_at(
-    believed: Believed,
     joint: BelievedJoint,
+    damping_n_s_per_m: float,
     x_b: np.ndarray,
     x_b_rate: np.ndarray,
+    part_s: float,
     left_out_m: np.ndarray | float = 0.0,
     right_out_m: np.ndarray | float = 0.0,
 ) -> Contact:
@@ -49,8 +52,7 @@ def contact_at(
     left_edge_m, right_edge_m = np.atleast_1d(-joint.left_m - left_out_m), np.atleast_1d(joint.right_m + right_out_m)
     side, depth_m, rate = _overlaps(
         x_b.ravel(), x_b_rate.ravel(), left_edge_m.ravel(), right_edge_m.ravel(),
-        joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m, contact_damping_n_s_per_m(believed),
-        believed.period_s / shape[-1],
+        joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m, damping_n_s_per_m, part_s,
     )  # fmt: skip
     return Contact(side.reshape(shape), depth_m.reshape(shape), rate.reshape(shape))
 
@@ -113,9 +115,9 @@ def _pushes_n(
     return force_n
 
 
-def contact_damping_n_s_per_m(believed: Believed) -> float:
-    """Return the damping that the joint is believed to have in contact only."""
-    return sum(row["damping_n_s_per_m"] for row in believed.effects if row["name"] == CONTACT_DAMPING)
+def contact_damping_n_s_per_m(effects: Iterable[dict[str, Any]]) -> float:
+    """Return the damping that these effects give the joint in contact only."""
+    return sum(row["damping_n_s_per_m"] for row in effects if row["name"] == CONTACT_DAMPING)
 
 
 def side_stiffness_n_per_m(joint: BelievedJoint, side: np.ndarray) -> np.ndarray:

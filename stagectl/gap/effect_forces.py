@@ -5,7 +5,6 @@ import numpy as np
 from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import late_readings
 from stagectl.gap.command_path import changed_by
-from stagectl.gap.contact import contact_damping_n_s_per_m
 from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
 from stagectl.gap.late_readings import makes_late
 from stagectl.gap.quantities import along_motion, quantities
@@ -18,7 +17,7 @@ def known_forces(recording: Recording, but: Trait | None = None) -> Forces:
     total = Forces(recording.felt_n["macro"].copy(), recording.felt_n["end"].copy() if recording.end else None)
     if total.end_n is not None and recording.believed.joint is not None:
         add_forces(total, between(recording, joint_force_n(recording)))
-    for row in (*recording.believed.effects, *recording.on_command):
+    for row in (*recording.believed.effects, *recording.at_size):
         effect = CATALOGUE[row["name"]]
         if but in effect.traits:
             continue
@@ -52,7 +51,7 @@ def _exchanged(recording: Recording) -> Forces:
         return total
     if recording.believed.joint is not None:
         add_forces(total, between(recording, joint_force_n(recording)))
-    for row in recording.believed.effects:
+    for row in (*recording.believed.effects, *recording.at_size):
         effect = CATALOGUE[row["name"]]
         if row["acts_on"] in ("contact", "joint") or "micro_motor_force_n" in effect.quantities:
             values = [row[name] for name in effect.parameters]
@@ -137,8 +136,7 @@ def _contact_changed(recording: Recording, pressing_n: np.ndarray, whole: bool) 
     if joint is None or recording.side is None:
         return 0.0 * pressing_n
     if whole:
-        damping = contact_damping_n_s_per_m(recording.believed)
-        there_n = recording.side * contact_of(recording).push_n(joint, damping)
+        there_n = recording.side * contact_of(recording).push_n(joint, recording.contact_damping_n_s_per_m)
         pressing_n = np.maximum(pressing_n, -there_n)
     return recording.side * pressing_n
 

@@ -217,7 +217,7 @@ def _driven_under(
     means_n = late_readings.motor_n(r.late, axis, r.log, command_n, latch_s, lag_s)
     late_s = float(np.mean(late_readings.delay_s(r.late, axis, r.log)))
     place = "macro_command" if axis == "macro" else "micro_command"
-    for row in (*r.believed.effects, *r.on_command):
+    for row in (*r.believed.effects, *r.at_size):
         if row["acts_on"] == place:
             effect = CATALOGUE[row["name"]]
             values = [row[name] for name in effect.parameters]

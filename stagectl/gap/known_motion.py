@@ -16,7 +16,7 @@ from stagectl.gap.noise import Explained
 from stagectl.gap.normal_equations import Group
 from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
-from stagectl.gap.settling import changes_commands, moved_by, moves_readings, settled
+from stagectl.gap.settling import is_taken_at_size, moved_by, settled
 
 _FORETOLD_PASSES = 3  # a friction is known along a motion that knows of the friction
 
@@ -42,7 +42,7 @@ def moved_under(
     known, moved: what was found in a search, and what was part of its operating point already; unsettled: the
     recordings before the joint's edges were put where they are.
     """
-    moving = [group for group in known if moves_readings(search, group) or changes_commands(search, group)]
+    moving = [group for group in known if is_taken_at_size(search, group)]
     still = [group for group in known if group not in moving]
     parameters = search.known_parameters
     explained = search.explained(known, [*parameters, *still])

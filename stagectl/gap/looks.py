@@ -22,7 +22,7 @@ from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
 from stagectl.gap.selection import ALIAS_GAIN
 from stagectl.gap.settling import (
-    changes_commands,
+    is_taken_at_size,
     left_at_size,
     moved_by,
     moved_now,
@@ -150,7 +150,7 @@ def _left_under(
     found: list[float] = []
     scales = None
     for chosen in models:
-        moving = [group for group in chosen if moves_readings(search, group) or changes_commands(search, group)]
+        moving = [group for group in chosen if is_taken_at_size(search, group)]
         moved = (*moved_now(search, chosen), *(moved_by(search, chosen, group) for group in moving))
         beside = tuple(search.term(group) for group in chosen if group not in moving)
         left, own = left_at_size(unsettled, search.noise, moved, beside, crew, scales)

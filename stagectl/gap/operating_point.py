@@ -16,7 +16,8 @@ from stagectl.gap.reading_errors import reading_error_m
 from stagectl.gap.recording import Recording
 
 Moved = tuple[Effect, str, dict[str, float]]
-"""An effect that moves the joint's geometry, the readings or what the drives make of commands: place, parameters."""
+"""An effect that moves the joint's geometry, the readings or what the drives make of commands, or that decides where a
+contact lets go: place, parameters."""
 
 
 _CORRECTIONS = 2
@@ -24,13 +25,14 @@ _CORRECTIONS = 2
 
 def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
     """Return a recording with sensor errors taken out of its positions, edges where effects have put them, drives that
-    make of their commands what effects of the command path do, and bodies that feel as late as they are read.
+    make of their commands what effects of the command path do, contacts that let go where the damping that was found
+    has them, and bodies that feel as late as they are read.
 
     What a sensor adds is taken along the readings at first, then along the motion that is left without it.
     """
     raw, believed = recording.log, recording.believed
     rows = [{"name": effect.name, "acts_on": place, **values} for effect, place, values in moved]
-    on_command = tuple(row for row in rows if row["acts_on"].endswith("_command"))
+    at_size = tuple(row for row in rows if row["acts_on"].endswith("_command") or row["acts_on"] == "contact")
     late = tuple(row for row, (effect, *_) in zip(rows, moved, strict=True) if makes_late(effect))
     misreading = [one for one in moved if one[1].endswith("_sensor") and not makes_late(one[0])]
     there = recording
@@ -49,7 +51,7 @@ def operating_point(recording: Recording, moved: Sequence[Moved]) -> Recording:
             elif log.end_position_m is not None:
                 true_m = _true_m(there, log.end_position_m, effect, place, parameters, number == 0)
                 log = replace(log, end_position_m=true_m)
-        there = recording_of(log, believed, on_command, late, (left_m, right_m))
+        there = recording_of(log, believed, at_size, late, (left_m, right_m))
     return there
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from stagectl.effects import Effect, Trait
 from stagectl.gap.command_path import PARTS_COUNT
-from stagectl.gap.contact import contact_at, contact_damping_n_s_per_m
+from stagectl.gap.contact import contact_at
 from stagectl.gap.forces import Forces
 from stagectl.gap.quantities import along_motion, quantities
 from stagectl.gap.recording import Recording, contact_of, relative_motion
@@ -93,9 +93,10 @@ def more_contact_n(
     if recording.end is None or joint is None:
         raise KeyError("joint")
     x_b, x_b_rate = relative_motion(recording)
-    damping = contact_damping_n_s_per_m(recording.believed)
+    damping = recording.contact_damping_n_s_per_m
     left_m, right_m = recording.edges_out_m
+    part_s = recording.log.period_s / x_b.shape[1]
     there = contact_at(
-        recording.believed, joint, x_b + apart_m, x_b_rate + apart_m_per_s, left_m + left_out_m, right_m + right_out_m
+        joint, damping, x_b + apart_m, x_b_rate + apart_m_per_s, part_s, left_m + left_out_m, right_m + right_out_m
     )
     return there.push_n(joint, damping) - contact_of(recording).push_n(joint, damping)

@@ -7,7 +7,7 @@ import numpy as np
 from stagectl.gap import late_readings
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.command_path import driven
-from stagectl.gap.contact import Contact, contact_at
+from stagectl.gap.contact import Contact, contact_at, contact_damping_n_s_per_m
 from stagectl.gap.forces import Forces
 from stagectl.gap.innovations import Noise
 from stagectl.gap.late_readings import Row
@@ -40,7 +40,7 @@ class Recording:
     reported_a: dict[str, np.ndarray]  # reported minus believed current at the samples, by axis, where it is known
     felt_n: dict[str, np.ndarray]  # motor forces on the clock of each body's readings, which may be late
     now: dict[str, Motion]  # motion at the samples' own instants
-    on_command: tuple[Row, ...] = ()  # effects of the command path that were found, as rows of a profile
+    at_size: tuple[Row, ...] = ()  # effects of the command path and the contact that were found, as rows of a profile
     late: tuple[Row, ...] = ()  # effects that make readings those of earlier instants
     edges_out_m: EdgesOut = (0.0, 0.0)
     found: Forces = field(default_factory=Forces)  # of effects that were found, of which none is part of the above
@@ -55,6 +55,11 @@ class Recording:
     def reaction_ratio(self) -> float:
         """Share of the micro's motor force that is believed to push the macro back."""
         return sum(row["fraction_ratio"] for row in self.believed.effects if row["name"] == "micro_reaction")
+
+    @property
+    def contact_damping_n_s_per_m(self) -> float:
+        """Damping of the joint in contact only, as believed and as found."""
+        return contact_damping_n_s_per_m((*self.believed.effects, *self.at_size))
 
     def motion(self, axis: str) -> Motion:
         """Motion of one body."""
@@ -91,7 +96,7 @@ def put_together(
     believed: Believed,
     macro: Motion,
     end: Motion | None,
-    on_command: tuple[Row, ...] = (),
+    at_size: tuple[Row, ...] = (),
     late: tuple[Row, ...] = (),
     edges_out_m: EdgesOut = (0.0, 0.0),
 ) -> Recording:
@@ -108,7 +113,7 @@ def put_together(
     else:
         end = None
     recording = Recording(
-        log, believed, macro, end, macro_n, micro_n, None, None, None, {}, {}, {}, {}, {}, {}, on_command, late,
+        log, believed, macro, end, macro_n, micro_n, None, None, None, {}, {}, {}, {}, {}, {}, at_size, late,
         edges_out_m,
     )  # fmt: skip
     _read(recording)
@@ -136,7 +141,11 @@ def _read(recording: Recording) -> None:
         recording.felt_n[axis] = _felt_n(late, axis, log, command_n, recording.belief(axis), motor_n)
         recording.now[axis] = late_readings.motion_now(late, axis, log, recording.motion(axis))
     if recording.end is not None and believed.joint is not None:
-        contact = contact_at(believed, believed.joint, *relative_motion(recording), *recording.edges_out_m)
+        part_s = log.period_s / recording.now["end"].position_m.shape[1]
+        contact = contact_at(
+            believed.joint, recording.contact_damping_n_s_per_m, *relative_motion(recording), part_s,
+            *recording.edges_out_m,
+        )  # fmt: skip
         recording.side, recording.penetration_m = contact.side, contact.depth_m
         recording.penetration_velocity_m_per_s = contact.depth_rate_m_per_s
 

@@ -136,11 +136,15 @@ def score(findings, truth):
 
 
 def parameter_marks(pairs):
-    """[(relative error of the amplitude, whether its interval holds it or None)] above ten times the limit."""
+    """[(relative error of the amplitude, whether its interval holds it or None)] above ten times the limit.
+
+    An effect that was named first as one of a set that can't be separated has no amplitude of the true one's: the bow
+    of the other ruler has the other sign.
+    """
     marks = []
     for found, member in pairs:
         name = member["amplitude"]
-        if not member["above_ten_times_limit"] or found["name"] != member["name"]:
+        if not member["above_ten_times_limit"] or any(found[key] != member[key] for key in ("name", "acts_on")):
             continue
         true, value = member["parameters"][name], found.get("parameters", {}).get(name)
         if value is None:
