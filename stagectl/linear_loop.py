@@ -10,6 +10,7 @@ Inputs and outputs are named and in SI units. What the two ends of a broken loop
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -54,9 +55,9 @@ _STEP_A = 1e-4  # of a torque word, in what it makes
 _MEMORY_STEP = 1e-7  # of what effects remember, whatever it is
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """What the forces push: a compiled plant, its parameters, its effects and the longest substep, s."""
+    """What the forces push: a compiled plant, its parameters, its effects and the longest substep, s; never changed."""
 
     module: ModuleType
     parameters: np.ndarray
@@ -361,7 +362,8 @@ def _tick_map(
     return _split(jacobian, n), slots.names
 
 
-def _body_map(body: Body, place: int, axes: Sequence[str], before_s: float, period_s: float) -> _Map:
+@lru_cache(maxsize=64)  # a search of gains asks for the same body again and again
+def _body_map(body: Body, place: int, axes: tuple[str, ...], before_s: float, period_s: float) -> _Map:
     """Return a body's map over a cycle: amperes until `before_s`, amperes after, forces -> what is seen, end's mean."""
     state = np.zeros(1, plant.PLANT_STATE)
     parameters = body.parameters.copy()
