@@ -6,11 +6,14 @@ events, and the rows that a recovery finds where no run was under way. Reads no 
 """
 
 import contextlib
+import math
 import os
+import shutil
 from collections import deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -33,9 +36,13 @@ class FlightRecorder:
         reserve: Callable[[str], Path],
         rows_kept_count: int,
         on_full_disk: Literal["stop", "go_on"],
-        say: Callable[[str, str], None] = lambda event, text: None,
+        say: Callable[..., object] = lambda event, text, **fields: None,
+        run_rows_limit_count: float = math.inf,
     ):
-        """Begin a session in `folder`; `reserve` makes folders for runs, `say` tells at once what the disk refuses."""
+        """Begin a session in `folder`; `reserve` makes folders for runs, `say` tells at once what becomes of them.
+
+        A run that has `run_rows_limit_count` rows goes on in another folder, without a row lost or doubled.
+        """
         self.folder = folder
         self.rows_count = 0
         self.trouble = ""
@@ -44,13 +51,29 @@ class FlightRecorder:
         """What the run under way was begun by."""
         self._manifest = {**manifest, "session": folder.name, "kept_by": "service"}
         self._reserve, self._kept_count, self._on_full_disk, self._say = reserve, rows_kept_count, on_full_disk, say
-        self._base = Recorder(folder, {**self._manifest, "trigger": "session"})
+        self._base: Recorder | None = None
         self._run: Recorder | None = None
-        self._run_first_row = 0
+        self._run_name = ""
+        self._run_rows_limit_count = run_rows_limit_count
+        self._disk = ThreadPoolExecutor(1, "runs")  # what waits for the disk while the stage moves
+        self._next: _Next | None = None
         self._rows: deque[np.ndarray] = deque()
         self._rows_held_count = 0
         self._events: deque[tuple[str, int, int, dict[str, Any]]] = deque(maxlen=_EVENTS_KEPT_COUNT)
-        self._lead_to(folder)
+        with self._policy():
+            self._begin_session()
+
+    def _begin_session(self) -> Recorder:
+        """Begin the session's own folder, where a full disk has not taken it yet. Errors: RecordError."""
+        if self._base is None:
+            base = Recorder(self.folder, {**self._manifest, "trigger": "session"})
+            try:
+                self._lead_to(self.folder)
+            except RecordError:
+                base.abandon()
+                raise
+            self._base = base
+        return self._base
 
     @property
     def recovery_folder(self) -> Path:
@@ -92,22 +115,28 @@ class FlightRecorder:
             self._rows_held_count -= len(self._rows.popleft())
         while self._events and self._events[0][2] < self.rows_count - self._rows_held_count:
             self._events.popleft()  # of rows that are gone
-        if self._run is not None:
-            with self._policy():
+        with self._policy():
+            if self._run is not None and self._run.rows_count >= self._run_rows_limit_count:
+                self.go_on_as(self._run_name, self.trigger)
+            self._take_next()
+            if self._run is not None:
                 self._run.append(rows)
 
     def event(self, name: str, t_ns: int, row: int | None = None, **fields: Any) -> None:
         """Keep an event with the session, and with the run under way."""
         self._events.append((name, int(t_ns), self.rows_count, fields))
         with self._policy():
-            self._base.event(name, t_ns, row, **fields)
+            if self._base is not None:
+                self._base.event(name, t_ns, row, **fields)
             if self._run is not None:
                 self._run.event(name, t_ns, **fields)
 
     def save_snapshot(self, states: Mapping[str, np.ndarray]) -> None:
-        """Keep the states that the session began from."""
+        """Keep the states that the session began from, and a run that began with it."""
         with self._policy():
-            self._base.save_snapshot(states)
+            for recorder in (self._base, self._run):
+                if recorder is not None:
+                    recorder.save_snapshot(states)
 
     def flush(self) -> None:
         """Write what the run under way has."""
@@ -118,13 +147,17 @@ class FlightRecorder:
     def close(self, end: Mapping[str, Any] | None = None) -> None:
         """End the run under way and the session."""
         self.end_run(end)
-        self._base.close(end)
+        self._disk.shutdown()
+        if self._base is not None:
+            self._base.close(end)
 
     def abandon(self) -> None:
         """Let go of all files as they are."""
-        if self._run is not None:
-            self._run.abandon()
-        self._base.abandon()
+        self._forget_next()
+        self._disk.shutdown()
+        for recorder in (self._run, self._base):
+            if recorder is not None:
+                recorder.abandon()
 
     @contextlib.contextmanager
     def _policy(self):
@@ -135,6 +168,7 @@ class FlightRecorder:
             self._tell(error)
             if self._on_full_disk == "stop":
                 raise
+            self._forget_next()
             run, self._run, self.trigger = self._run, None, ""
             if run is not None:
                 with contextlib.suppress(RecordError, OSError):
@@ -147,24 +181,87 @@ class FlightRecorder:
 
     # ---- runs ------------------------------------------------------------------------------------------------
 
-    def begin_run(self, name: str, trigger: str, t_ns: int) -> None:
-        """Record from now on; the run under way goes on where there is one. Errors: RecordError."""
-        if self._run is not None:
-            return
+    def begin_run(self, name: str, trigger: str, t_ns: int | None) -> None:
+        """Record from now on; the run under way goes on where there is one. Errors: RecordError.
+
+        `t_ns` is None before the servo's first cycle: all that it leaves is the run's.
+        """
         with self._policy():
+            if self._run is None and self._next is not None:  # asked for, and about to be there
+                wait([self._next.made])
+                self._take_next()
+            if self._run is not None:
+                return
+            self._begin_session()
             folder = self._reserve(name)
-            begun = {**self._manifest, "trigger": trigger, "start_t_ns": t_ns}
+            begun = {**self._manifest, "trigger": trigger, **({} if t_ns is None else {"start_t_ns": t_ns})}
             run = Recorder(folder, begun, durable=True)
             try:
-                run.event("begin", t_ns, trigger=trigger)
+                run.event("begin", t_ns or 0, trigger=trigger)
                 self._lead_to(folder)
             except RecordError:
                 run.abandon()  # else it would record on without anybody to end it
                 raise
-            self._run, self.trigger, self.trouble = run, trigger, ""
+            self._run, self._run_name, self.trigger, self.trouble = run, name, trigger, ""
+
+    def go_on_as(self, name: str, trigger: str, end: Mapping[str, Any] | None = None) -> None:
+        """Record into another folder from soon on, without a row lost or doubled; the run under way ends with `end`.
+
+        Making a folder and closing one wait for the disk, and the stage moves meanwhile: a thread does both.
+        """
+        if self._next is not None and self._next.trigger == trigger:
+            return
+        self._forget_next()
+        begun = {**self._manifest, "trigger": trigger}
+        if self._run is not None:
+            begun["continues"] = self._run.folder.name
+        self._next = _Next(self._disk.submit(self._made, name, begun), name, trigger, dict(end or {}))
+
+    def _take_next(self) -> None:
+        """Go on in the next folder, where it is there. Errors: RecordError."""
+        if self._next is None or not self._next.made.done():
+            return
+        following, self._next, before = self._next, None, self._run
+        try:
+            new = following.made.result()
+        except RecordError as error:
+            if before is None:  # it was asked for, and nothing depends on it
+                self._tell(error)
+                return
+            raise
+        try:
+            if before is not None:
+                before.flush()  # a recovery goes on behind the last row there
+            self._lead_to(new.folder)
+        except RecordError:
+            self._disk.submit(_remove, new)
+            raise
+        self._run, self._run_name, self.trigger, self.trouble = new, following.name, following.trigger, ""
+        if before is None:
+            self._say("run", "begun", run=new.folder.name, trigger=following.trigger)
+            return
+        self._say("run", f"goes on behind {before.folder.name}", run=new.folder.name, trigger=following.trigger)
+        self._disk.submit(self._close_continued, before, {**following.end, "continued_by": new.folder.name})
+
+    def _made(self, name: str, manifest: dict[str, Any]) -> Recorder:
+        return Recorder(self._reserve(name), manifest, durable=True)
+
+    def _close_continued(self, run: Recorder, end: Mapping[str, Any]) -> None:
+        try:
+            run.close(end)
+        except (RecordError, OSError) as error:
+            run.abandon()  # its rows are in the file: the next start marks it as recovered
+            self._say("record_lost", str(error))
+
+    def _forget_next(self) -> None:
+        """Remove the folder that a run was to go on in, as soon as it is made."""
+        following, self._next = self._next, None
+        if following is not None:
+            following.made.add_done_callback(lambda made: _remove(made.result()) if made.exception() is None else None)
 
     def end_run(self, end: Mapping[str, Any] | None = None) -> Path | None:
         """Close the run under way and return its folder; None where there was none. Errors: RecordError."""
+        self._forget_next()
         run = self._run
         if run is None:
             return None
@@ -174,24 +271,61 @@ class FlightRecorder:
             self._lead_to(self.folder)
         return run.folder
 
-    def save_last(self, name: str, trigger: str) -> Path | None:
-        """Write the last seconds as a run of their own, beside one under way; None where there are no rows."""
-        return self.save_window(name, trigger, self.rows_count - self._kept_count, self.rows_count)
+    def save_last(self, name: str, trigger: str, text: str) -> None:
+        """Write the last seconds as a run of their own, beside one under way."""
+        self.save_window(name, trigger, text, self.rows_count - self._kept_count, self.rows_count)
 
-    def save_window(self, name: str, trigger: str, first_row: int, end_row: int) -> Path | None:
-        """Write the rows of the session from `first_row` to before `end_row` as a run, as far as they are kept."""
+    def save_window(self, name: str, trigger: str, text: str, first_row: int, end_row: int) -> None:
+        """Write the session's rows from `first_row` to before `end_row` as a run, as far as they are kept.
+
+        A thread does it, half a minute at 1 kHz is 38 MB; `text` is said once the run is there.
+        """
         kept_from = self.rows_count - self._rows_held_count
         first_row, end_row = max(first_row, kept_from), min(end_row, self.rows_count)
         if end_row <= first_row:
-            return None
-        with self._policy():
-            rows = np.concatenate(list(self._rows))[first_row - kept_from : end_row - kept_from]
-            folder = self._reserve(name)
-            saved = Recorder(folder, {**self._manifest, "trigger": trigger, "start_t_ns": int(rows["t_ns"][0])})
-            for event, t_ns, row, fields in self._events:
-                if first_row <= row < end_row or row == end_row == self.rows_count:
-                    saved.event(event, t_ns, row - first_row, **fields)
-            saved.append(rows)
-            saved.close({"trigger": trigger})
-            return folder
-        return None
+            return
+        pieces: list[np.ndarray] = []
+        for rows in self._rows:
+            pieces.append(rows[max(first_row - kept_from, 0) : max(end_row - kept_from, 0)])
+            kept_from += len(rows)
+        events = [
+            (event, t_ns, row - first_row, fields)
+            for event, t_ns, row, fields in self._events
+            if first_row <= row < end_row or row == end_row == self.rows_count
+        ]
+        self._disk.submit(self._save, name, trigger, text, [rows for rows in pieces if len(rows)], events)
+
+    def _save(self, name: str, trigger: str, text: str, pieces: list[np.ndarray], events: list[tuple]) -> None:
+        try:
+            start = {"start_t_ns": int(pieces[0]["t_ns"][0])}
+            saved = Recorder(self._reserve(name), {**self._manifest, "trigger": trigger, **start})
+            try:
+                for event, t_ns, row, fields in events:
+                    saved.event(event, t_ns, row, **fields)
+                for rows in pieces:
+                    saved.append(rows)
+                saved.close({"trigger": trigger})
+            except RecordError:
+                saved.abandon()
+                raise
+        except RecordError as error:
+            self._tell(error)
+        else:
+            self._say("run", text, run=saved.folder.name, trigger=trigger)
+
+
+class _Next(NamedTuple):
+    """The run that rows go to as soon as its folder is there."""
+
+    made: Future[Recorder]
+    name: str
+    trigger: str
+    end: dict[str, Any]
+    """How the run before it ends."""
+
+
+def _remove(run: Recorder) -> None:
+    """Remove a run that never got a row."""
+    with contextlib.suppress(OSError):
+        run.abandon()
+    shutil.rmtree(run.folder, ignore_errors=True)

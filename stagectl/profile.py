@@ -299,6 +299,7 @@ class Record(Table):
 
     when: Literal["armed", "always"] = "armed"
     flight_s: Annotated[float, within(1.0, 600.0)] = 30.0
+    run_length_s: Annotated[float, within(10.0, 86400.0)] = 3600.0
     on_full_disk: Literal["stop", "go_on"] = "stop"
     size_limit_bytes: Annotated[int, whole(10**6, 10**15)] = 100_000_000_000
     age_limit_s: Annotated[float, within(60.0, 1e10)] = 30 * 86400.0

@@ -152,6 +152,7 @@ class Recorder:
             self._samples.put(encode_schema(self._schema))
             self._events = WholeFile(self.folder / EVENTS)
         except OSError as error:
+            self._leave_nothing()
             raise RecordError(
                 f"{self.folder}: can't begin a run: {error.strerror} ({free_text(self.folder)}); nothing was recorded; "
                 "free space, check permissions, or give another folder"
@@ -159,6 +160,16 @@ class Recorder:
         self._log = _structured_log(self._put_event)
         if durable:
             self._onto_disk = OntoDisk((self._samples, self._events))
+
+    def _leave_nothing(self) -> None:
+        """Remove what there is of a run that could not be begun: it would count as one that crashed."""
+        for file in (vars(self).get("_samples"), vars(self).get("_events")):
+            if file is not None:
+                with contextlib.suppress(OSError):
+                    file.close()
+        for name in (MANIFEST, SAMPLES, EVENTS, _RESERVE):
+            with contextlib.suppress(OSError):
+                (self.folder / name).unlink()
 
     @property
     def recovery_folder(self) -> Path:
@@ -557,7 +568,7 @@ def _join(
         raise RecordError(
             f"{folder}: {SAMPLES} has another layout than the ring; recover with the version that made it"
         )
-    start_t_ns = manifest.get("start_t_ns", np.iinfo(np.int64).min) if last is None else int(last["t_ns"]) + 1
+    start_t_ns = _start_t_ns(folder, manifest) if last is None else int(last["t_ns"]) + 1
     rows = held_rows[held_rows["t_ns"] >= start_t_ns]
     lost_count = overwritten_count
     if overwritten_count and last is not None:  # the file may have them
@@ -577,6 +588,18 @@ def _join(
         "last_t_ns": times_ns[-1] if times_ns else None,
     }
     return Recovery(rows_count=len(rows), rows_lost_count=lost_count), whole
+
+
+def _start_t_ns(folder: Path, manifest: dict) -> int:
+    """Return from when on rows belong to a run that has none yet; the run that it continues has those before."""
+    if isinstance(continued := manifest.get("continues"), str):
+        path = folder.resolve().parent / continued / SAMPLES  # a session's link may lead here
+        with contextlib.suppress(RecordError, OSError):  # removed meanwhile
+            found = extent(path)
+            newest = found.first if found.last is None else found.last
+            if newest is not None:
+                return int(_rows_of(newest, found.schema, path)["t_ns"][-1]) + 1
+    return manifest.get("start_t_ns", np.iinfo(np.int64).min)
 
 
 def _finish_recovered(folder: Path, manifest: dict, recovery: Recovery, whole: dict[str, int | None]) -> None:

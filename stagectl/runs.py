@@ -46,7 +46,9 @@ __all__ = [
     "list_runs",
     "new_run_folder",
     "profile_of",
+    "run_folders",
     "show",
+    "summary",
 ]
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
@@ -87,23 +89,26 @@ class RunSummary:
     note: str = ""
 
 
-def list_runs(root: Path, count_under_way: bool = True) -> list[RunSummary]:
+def list_runs(root: Path) -> list[RunSummary]:
     """Summarise every run folder under `root`, oldest first; a damaged run is listed and raises nothing.
-
-    Rows of a run under way are counted by reading them; without `count_under_way` they are 0.
 
     Errors: RequestError where `root` is a file.
     """
+    return [summary(folder) for folder in run_folders(root)]
+
+
+def run_folders(root: Path) -> list[Path]:
+    """Return every folder under `root` that may be a run, oldest first. Errors: RequestError where `root` is a file."""
     root = Path(root)
     if root.is_file():
         raise RequestError(f"{root}: is a file, and runs lie in a folder; give that folder")
     if not root.is_dir():
         return []
-    folders = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
-    return [_summary(folder, count_under_way) for folder in folders]
+    return sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
-def _summary(folder: Path, count_under_way: bool) -> RunSummary:
+def summary(folder: Path, count_under_way: bool = True) -> RunSummary:
+    """Summarise one run; rows of one under way are counted, without `count_under_way` they are 0."""
     try:
         manifest = read_manifest(folder)
         record = manifest.get("record", {})
@@ -177,17 +182,17 @@ def show(folder: Path) -> dict[str, Any]:
     """Describe one run for people and for --json: what, how long, how it ended, health of its cycles, events."""
     run = read_run(folder)
     rows = run.rows
-    summary = _summary(run.folder, True)
-    missing_count, note = run.rows_missing_count, summary.note
+    summarised = summary(run.folder)
+    missing_count, note = run.rows_missing_count, summarised.note
     if missing_count:
         note = missing_text(missing_count, missing_count + len(rows))
     description: dict[str, Any] = {
         "folder": str(run.folder),
-        "state": "damaged" if missing_count else summary.state,
+        "state": "damaged" if missing_count else summarised.state,
         "note": note,
-        "profile": summary.profile,
-        "stop": summary.stop,
-        "text": summary.text,
+        "profile": summarised.profile,
+        "stop": summarised.stop,
+        "text": summarised.text,
         "rows_count": len(rows),
         "rows_missing_count": missing_count,
         "duration_s": float((rows["t_ns"][-1] - rows["t_ns"][0]) * 1e-9) if len(rows) else 0.0,

@@ -7,9 +7,10 @@ from typing import Any
 
 from sim_backend.machine import load_machine, machine_path_for
 from stagectl.backend import RIG, RIG_DRIVES, RIG_SENSOR, BatchBackend, HardwareBackend, RigBackend
-from stagectl.errors import LinkError, RequestError
+from stagectl.errors import LinkError, RecordError, RequestError
 from stagectl.profile import Profile
 from stagectl.run_folder import reserve
+from stagectl.runs import new_run_folder
 from stagectl.session import Progress
 from stagectl.supervisor import Supervisor
 
@@ -57,6 +58,16 @@ def choose(profile: Profile, backend: str) -> str:
     )
 
 
+def _folder_of(profile: Profile, runs_root: Path, name: str, kept_by_service: bool) -> Path:
+    """Reserve a run's folder; the service may go on without, where the disk is full and the profile wants it so."""
+    try:
+        return reserve(runs_root, name)
+    except RecordError:
+        if not kept_by_service or profile.record.on_full_disk == "stop":
+            raise
+        return new_run_folder(runs_root, name)
+
+
 def open_stage(
     profile: Profile,
     backend: str = "auto",
@@ -95,7 +106,7 @@ def open_stage(
         "seeds": [seed],
     }
     try:
-        folder = reserve(runs_root, name)
+        folder = _folder_of(profile, runs_root, name, kept_by_service="record" in watching)
     except BaseException:
         world.close()
         raise

@@ -18,6 +18,7 @@ from stagectl.service.access import Role
 from stagectl.service.desk import Busy, Desk, Ending, Unfit
 from stagectl.service.exposition import Figures
 from stagectl.service.lease import LeaseRefused
+from stagectl.service.run_list import RunList
 from stagectl.service.scope import COLUMNS
 from stagectl.service.service_log import ServiceLog
 
@@ -114,6 +115,8 @@ def _sentence(problem: Any) -> str:
 
 
 def _watch_routes(app: FastAPI, desk: Desk, log: ServiceLog, figures: Figures, runs_root: Path) -> None:
+    run_list = RunList(runs_root)
+
     @app.get("/v1/status")
     async def status() -> messages.Status:
         """Where things stand."""
@@ -132,10 +135,8 @@ def _watch_routes(app: FastAPI, desk: Desk, log: ServiceLog, figures: Figures, r
         return log.last(limit) if after is None else log.after(after, limit)
 
     @app.get("/v1/runs")
-    def runs() -> list[messages.RunEntry]:
+    async def runs() -> list[messages.RunEntry]:
         """What was recorded, oldest first; rows of a run under way are not counted."""
-        from stagectl.runs import list_runs
-
         return [
             messages.RunEntry(
                 name=run.folder.name,
@@ -146,7 +147,7 @@ def _watch_routes(app: FastAPI, desk: Desk, log: ServiceLog, figures: Figures, r
                 stop=run.stop,
                 text=run.note or run.text,
             )
-            for run in list_runs(runs_root, count_under_way=False)
+            for run in await run_list.summaries()
         ]
 
     @app.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})

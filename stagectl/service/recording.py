@@ -12,15 +12,20 @@ import numpy as np
 from stagectl.errors import RecordError, RequestError
 from stagectl.flight_recorder import FlightRecorder
 from stagectl.profile import Profile
-from stagectl.record import Recorder, read_manifest
+from stagectl.record import read_manifest
 from stagectl.recording_trigger import Trigger, TriggerWatch
 from stagectl.retention import prune
+from stagectl.row import ROW
 from stagectl.run_folder import reserve
 from stagectl.service import messages
 from stagectl.service.service_log import ServiceLog
+from stagectl.signals import STOP_TEXT, Stop
 
-ARM, REQUEST, FAULT = "arm", "request", "fault"
+ARM, REQUEST, FAULT, ALWAYS = "arm", "request", "fault", "always"
 _PRUNE_EVERY_S = 600.0
+_RUNS_LEAST_COUNT = 10
+"""Runs that share the room for all: the oldest can only go when it is closed."""
+_RUN_LEAST_ROWS_COUNT = 60_000  # a minute at 1 kHz, however little room there is
 
 
 class Recording:
@@ -29,7 +34,7 @@ class Recording:
     def __init__(self, runs_root: Path, log: ServiceLog):
         """No session yet."""
         self._runs_root, self._log = runs_root, log
-        self._recorder: Recorder | FlightRecorder | None = None
+        self._recorder: FlightRecorder | None = None
         self._over = threading.Event()
         self._profile: Profile | None = None
         self._pruning: threading.Thread | None = None
@@ -38,36 +43,35 @@ class Recording:
         self._left_count = 0
         self._window: tuple[int, int] | None = None  # rows of the session, the end of which is still to come
 
-    def factory(self, profile: Profile) -> Callable[[Path, dict[str, Any]], Recorder | FlightRecorder]:
+    def factory(self, profile: Profile) -> Callable[[Path, dict[str, Any]], FlightRecorder]:
         """Return what makes the recorder of a session with this profile."""
         self._profile = profile
 
-        def make(folder: Path, manifest: dict[str, Any]) -> Recorder | FlightRecorder:
-            if profile.record.when == "always":
-                self._recorder = Recorder(folder, {**manifest, "kept_by": "service"}, durable=True)
-            else:
-                self._recorder = FlightRecorder(
-                    folder,
-                    manifest,
-                    lambda name: reserve(self._runs_root, name),
-                    round(profile.record.flight_s * profile.cycle.rate_hz),
-                    profile.record.on_full_disk,
-                    lambda event, text: self._say(event, text),
-                )
-            return self._recorder
+        def make(folder: Path, manifest: dict[str, Any]) -> FlightRecorder:
+            limits, rate_hz = profile.record, profile.cycle.rate_hz
+            room_count = max(limits.size_limit_bytes // _RUNS_LEAST_COUNT // ROW.itemsize, _RUN_LEAST_ROWS_COUNT)
+            recorder = self._recorder = FlightRecorder(
+                folder,
+                manifest,
+                lambda name: reserve(self._runs_root, name),
+                round(limits.flight_s * rate_hz),
+                limits.on_full_disk,
+                self._log.say,
+                min(round(limits.run_length_s * rate_hz), room_count),
+            )
+            if profile.record.when == ALWAYS:
+                try:
+                    recorder.begin_run(f"service-{ALWAYS}", ALWAYS, None)
+                except RecordError:
+                    recorder.abandon()
+                    raise
+            return recorder
 
         return make
 
-    def _say(self, event: str, text: str) -> None:
-        self._log.say(event, text)
-
-    @property
-    def _flight(self) -> FlightRecorder | None:
-        return self._recorder if isinstance(self._recorder, FlightRecorder) else None
-
     def begin(self, name: str, trigger: str, t_ns: int) -> None:
         """Begin a run where none is under way. Errors: RequestError where the disk does not take it."""
-        flight = self._flight
+        flight = self._recorder
         if flight is None or flight.run_folder is not None:
             return
         try:
@@ -79,7 +83,7 @@ class Recording:
 
     def end(self, trigger: str, stop: str, text: str) -> None:
         """End the run under way where `trigger` began it."""
-        flight = self._flight
+        flight = self._recorder
         if flight is None or flight.run_folder is None or flight.trigger != trigger:
             return
         try:
@@ -89,18 +93,29 @@ class Recording:
             return
         self._log.say("run", "ended", run=folder.name if folder is not None else "", trigger=trigger)
 
+    def begin_on_request(self, name: str) -> None:
+        """Begin a run that a client asked for, where none is under way; the stage may move meanwhile."""
+        flight = self._recorder
+        if flight is not None and flight.run_folder is None:
+            flight.go_on_as(f"service-{name}", REQUEST)
+
+    def end_on_request(self, powered: bool) -> None:
+        """End the run that a client asked for; a motion that is under way goes on being recorded, in its own."""
+        flight, stop, text = self._recorder, Stop.OPERATOR.name, STOP_TEXT[Stop.OPERATOR]
+        if flight is None:
+            return
+        if flight.run_folder is None:
+            flight.end_run()  # it is not there yet
+        elif powered and flight.trigger == REQUEST:
+            flight.go_on_as(f"service-{ARM}", ARM, {"stop": stop, "text": text})
+        else:
+            self.end(REQUEST, stop, text)
+
     def save_last(self, kind: str) -> None:
         """Write the last seconds, where no run has them."""
-        flight = self._flight
-        if flight is None or flight.run_folder is not None:
-            return
-        try:
-            folder = flight.save_last(f"service-{FAULT}", kind)
-        except RecordError as error:
-            self._log.say("record_lost", str(error))
-            return
-        if folder is not None:
-            self._log.say("run", "the last seconds", run=folder.name, trigger=kind)
+        flight = self._recorder
+        if flight is not None and flight.run_folder is None:
+            flight.save_last(f"service-{FAULT}", kind, "the last seconds")
 
     def wait_for(self, asked: messages.SetTrigger | None) -> None:
         """Wait for an event to record, or for none any more."""
@@ -110,7 +125,7 @@ class Recording:
 
     def observe(self, rows: np.ndarray) -> None:
         """Look for the event in rows, shape (n,) of ROW, that the recorder takes next."""
-        flight, watch, asked, profile = self._flight, self._watch, self._asked, self._profile
+        flight, watch, asked, profile = self._recorder, self._watch, self._asked, self._profile
         if flight is None or watch is None or asked is None or profile is None:
             return
         found = watch.first(rows)
@@ -120,32 +135,22 @@ class Recording:
 
     def save_event(self) -> None:
         """Write what is around the event as a run, once its end is there."""
-        flight, asked, watch, window = self._flight, self._asked, self._watch, self._window
+        flight, asked, watch, window = self._recorder, self._asked, self._watch, self._window
         if flight is None or asked is None or watch is None or window is None or flight.rows_count < window[1]:
             return
         self._window, self._left_count = None, self._left_count - 1
-        try:
-            folder = flight.save_window(f"service-{asked.name}", watch.trigger.text, *window)
-        except RecordError as error:
-            self._log.say("record_lost", str(error))
-            return
-        if folder is not None:
-            self._log.say("run", "around an event", run=folder.name, trigger=watch.trigger.text)
+        flight.save_window(f"service-{asked.name}", watch.trigger.text, "around an event", *window)
 
     def folder(self, session: Path) -> Path:
         """Return the run that rows go to now, the session's own folder where there is none."""
-        flight = self._flight
+        flight = self._recorder
         return session if flight is None or flight.run_folder is None else flight.run_folder
 
     def message(self) -> messages.Recording | None:
         """Say what goes to the disk now."""
-        recorder, flight = self._recorder, self._flight
-        if recorder is None:
-            return None
+        flight = self._recorder
         if flight is None:
-            return messages.Recording(
-                run=recorder.folder.name, trigger="always", rows_count=recorder.rows_count, trouble=""
-            )
+            return None
         run = flight.run_folder
         return messages.Recording(
             run="" if run is None else run.name,

@@ -136,16 +136,13 @@ class StageState:
         if trigger is not None:
             self._recording.wait_for(None if isinstance(trigger, str) else trigger)
         self._recording.save_event()
-        asked, stage = self.desk.next_record_request(), self._stage
-        if asked is None or stage is None or self._opening:
+        asked = self.desk.next_record_request()
+        if asked is None or self._stage is None or self._opening:
             return
-        try:
-            if asked == "":
-                self._recording.end(recording.REQUEST, Stop.OPERATOR.name, STOP_TEXT[Stop.OPERATOR])
-            else:
-                self._recording.begin(asked, recording.REQUEST, stage.link.now_t_ns())
-        except RequestError as error:
-            self._log.say("record_lost", str(error))
+        if asked == "":
+            self._recording.end_on_request(self._state in states.POWERED)
+        else:
+            self._recording.begin_on_request(asked)
 
     def _enter(self, event: Event, text: str = "") -> None:
         before, self._state = self._state, states.after(self._state, event)

@@ -30,11 +30,11 @@ PATIENT = {  # limits that a busy test host does not pass
 class Daemon:
     """A service of its own, with everything that it leaves below one folder."""
 
-    def __init__(self, folder: Path, changes: dict = PATIENT, runs: Path | None = None):
+    def __init__(self, folder: Path, changes: dict = PATIENT, runs: Path | None = None, profile: str = "single-axis"):
         self.folder = folder
         (folder / "tmp").mkdir(parents=True)
         self.profile = folder / "patient.toml"
-        self.profile.write_text(changed(PROFILES_FOLDER / "single-axis.toml", changes))
+        self.profile.write_text(changed(PROFILES_FOLDER / f"{profile}.toml", changes))
         self.socket = folder / "stage.socket"
         self.state = folder / "state"
         self.runs = folder / "runs" if runs is None else runs

@@ -1,7 +1,11 @@
 """What a session leaves: runs of powered motion, the last seconds before a fault, and no more than it may."""
 
+import asyncio
 import json
+import math
 import os
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +21,10 @@ from stagectl.retention import AGES, KEEP, prune
 from stagectl.ring import RingWriter
 from stagectl.row import new_rows
 from stagectl.run_folder import reserve
-from stagectl.runs import list_runs
+from stagectl.runs import list_runs, run_folders
 from stagectl.service import messages
 from stagectl.service.desk import Unfit
+from stagectl.service.run_list import RunList
 from tests.service.test_stage_loop import Bench
 from tests.small_disk import small_disk
 from tests.toml_text import changed
@@ -35,12 +40,88 @@ def rows_from(first: int, count: int) -> np.ndarray:
     return rows
 
 
-def flight(root: Path, kept_count: int = 100, policy="stop", said=None) -> FlightRecorder:
-    def say(event: str, text: str) -> None:
+def bytes_read() -> int:
+    return int(Path("/proc/self/io").read_text().split()[1])  # rchar: asked of the kernel, from the disk or not
+
+
+def flight(root: Path, kept_count: int = 100, policy="stop", said=None, limit_count=math.inf) -> FlightRecorder:
+    def say(event: str, text: str, **fields) -> None:
         if said is not None:
             said.append((event, text))
 
-    return FlightRecorder(reserve(root, "session"), {}, lambda name: reserve(root, name), kept_count, policy, say)
+    return FlightRecorder(
+        reserve(root, "session"),
+        {"kept_by": "service"},
+        lambda name: reserve(root, name),
+        kept_count,
+        policy,
+        say,
+        limit_count,
+    )
+
+
+def record_until_it_goes_on(session: FlightRecorder, first: int) -> int:
+    """Hand over rows until the run under way is another one; return the first row that was not."""
+    folder = session.run_folder
+    while session.run_folder == folder:
+        session.append(rows_from(first, 20))
+        first += 20
+        time.sleep(0.001)
+    return first
+
+
+def test_a_long_run_goes_on_in_another_folder_without_a_row_lost(tmp_path):
+    said = []
+    session = flight(tmp_path, said=said, limit_count=500)
+    session.begin_run("motion", "arm", 0)
+    folders, end = [session.run_folder], 0
+    for _ in range(3):
+        end = record_until_it_goes_on(session, end)
+        folders.append(session.run_folder)
+        assert session.recovery_folder.resolve() == session.run_folder
+        assert session.trigger == "arm"
+    assert session.end_run({"stop": "FINISHED"}) == folders[-1]
+    session.close()
+    runs = [read_run(folder) for folder in folders]
+    assert np.concatenate([run.rows for run in runs])["cycle"].tolist() == list(range(end))
+    assert [run.manifest["record"]["state"] for run in runs] == ["closed"] * 4
+    assert all(len(run.rows) >= 500 for run in runs[:3])
+    assert [run.manifest.get("continues") for run in runs] == [None, *(folder.name for folder in folders[:3])]
+    assert [run.manifest["end"].get("continued_by") for run in runs] == [*(folder.name for folder in folders[1:]), None]
+    assert {path for path in tmp_path.iterdir() if path.is_dir()} == {session.folder, *folders}
+    assert len(said) == 3
+
+
+def test_a_service_that_dies_as_a_run_goes_on_loses_and_doubles_no_row(tmp_path):
+    session = flight(tmp_path, limit_count=500)
+    session.begin_run("motion", "arm", 0)
+    first = session.run_folder
+    ring_path = tmp_path / "stagectl-test.ring"
+    ring = RingWriter(ring_path, 8192, run_folder=session.recovery_folder.absolute())
+    end = record_until_it_goes_on(session, 0)  # the new run has its first rows in memory only
+    for row in rows_from(0, end + 30):
+        ring.write(row.reshape(1))
+    second = session.run_folder
+    session.abandon()
+    ring.close()
+    recover(ring_path, session.recovery_folder)
+    finish_left_runs(tmp_path, tmp_path)
+    rows = np.concatenate([read_run(folder).rows for folder in (first, second)])
+    assert rows["cycle"].tolist() == list(range(end + 30))
+
+
+def test_a_run_that_ends_before_it_goes_on_leaves_no_empty_one(tmp_path):
+    session = flight(tmp_path, limit_count=500)
+    session.begin_run("motion", "arm", 0)
+    folder = session.run_folder
+    session.append(rows_from(0, 500))
+    session.append(rows_from(500, 10))  # asks for the next
+    session.end_run({"stop": "FINISHED"})
+    session.close()
+    assert {path for path in tmp_path.iterdir() if path.is_dir()} >= {session.folder, folder}
+    with_rows = [read_run(path).rows for path in sorted(tmp_path.glob("*-motion*"))]
+    assert all(len(rows) for rows in with_rows)
+    assert np.concatenate(with_rows)["cycle"].tolist() == list(range(510))
 
 
 def test_only_the_last_rows_are_kept_and_written_when_there_is_a_reason(tmp_path):
@@ -49,9 +130,9 @@ def test_only_the_last_rows_are_kept_and_written_when_there_is_a_reason(tmp_path
         session.append(rows_from(first, 20))
     session.event("emergency", 950 * MS_NS, code=3)
     session.append(rows_from(1000, 5))
-    saved = session.save_last("fault", "LEASE")
+    session.save_last("fault", "LEASE", "the last")
     session.close()
-    run = read_run(saved)
+    run = read_run(*tmp_path.glob("*-fault"))
     assert run.rows["cycle"].tolist() == list(range(905, 1005))
     assert run.manifest["trigger"] == "LEASE"
     assert [(event["event"], event["row"]) for event in run.events] == [("emergency", 95)]
@@ -237,6 +318,70 @@ def bench(tmp_path):
     made.loop.run()
 
 
+@pytest.mark.parametrize("when", ["armed", "always"])
+@pytest.mark.parametrize("full", ["of bytes", "of folders"])
+def test_on_a_disk_that_is_full_already_motion_goes_on_where_the_profile_says_so(tmp_path, when, full):
+    record = {"when": when, "on_full_disk": "go_on"}
+    path = tmp_path / "mine.toml"
+    path.write_text(changed(PROFILES_FOLDER / "single-axis.toml", {"record": record}))
+    with small_disk(tmp_path / "runs") as disk:
+        (disk / "others").write_bytes(bytes(4 << 20))
+        place = tmp_path
+        if full == "of folders":  # none can be made in what is a file
+            place = tmp_path / "bench"
+            place.mkdir()
+            (place / "runs").symlink_to(disk / "others")
+        made = Bench(place, profile=str(path))
+        made.until(lambda: made.loop._state == "idle")
+        made.loop.step()
+        assert "can't begin a run" in made.status.recording.trouble
+        made.take()
+        assert made.do("home", messages.Home()).stop == "FINISHED"
+        assert made.do("arm", messages.Arm()).stop == "FINISHED"
+        assert made.do("move", messages.Move(target_m=0.01)).stop == "FINISHED"
+        assert [path.name for path in disk.iterdir() if path.is_file()] == ["others"]
+        made.loop.leave()
+        made.loop.run()
+
+
+@pytest.mark.parametrize("when", ["armed", "always"])
+def test_on_a_disk_that_is_full_already_nothing_opens_where_the_profile_says_stop(tmp_path, when):
+    path = tmp_path / "mine.toml"
+    path.write_text(changed(PROFILES_FOLDER / "single-axis.toml", {"record": {"when": when}}))
+    with small_disk(tmp_path / "runs") as disk:
+        (disk / "others").write_bytes(bytes(4 << 20))
+        made = Bench(tmp_path, profile=str(path))
+        made.until(lambda: made.loop._state == "fault")
+        made.loop.step()
+        assert "can't begin a run" in made.status.fault.values
+        made.loop.leave()
+        made.loop.run()
+
+
+def test_a_session_that_is_recorded_always_is_one_run_and_stops_or_goes_on_as_the_profile_says(tmp_path):
+    path = tmp_path / "mine.toml"
+    record = {"when": "always", "on_full_disk": "go_on"}
+    path.write_text(changed(PROFILES_FOLDER / "single-axis.toml", {"record": record}))
+    with small_disk(tmp_path / "runs", 24 << 20) as disk:
+        made = Bench(tmp_path, profile=str(path))
+        made.until(lambda: made.loop._state == "idle")
+        made.loop.step()
+        (folder,) = disk.glob("*-service-always")
+        assert (made.status.recording.trigger, made.status.recording.run) == ("always", folder.name)
+        made.take()
+        assert made.do("home", messages.Home()).stop == "FINISHED"
+        room = os.statvfs(disk)
+        (disk / "others").write_bytes(bytes(room.f_bavail * room.f_frsize))
+        assert made.do("arm", messages.Arm()).stop == "FINISHED"
+        made.until(lambda: made.status.recording.trouble)
+        assert made.do("move", messages.Move(target_m=0.01)).stop == "FINISHED"
+        made.loop.leave()
+        made.loop.run()
+        run = read_run(folder)
+        assert run.snapshot  # and so it can be replayed
+        assert np.all(np.diff(run.rows["cycle"]) == 1)
+
+
 def runs_of(bench, name: str) -> list[Path]:
     return sorted(bench.settings.runs_root.glob(f"*-service-{name}"))
 
@@ -264,10 +409,11 @@ def test_powered_motion_is_recorded_and_a_fault_while_idle_has_its_last_seconds(
     assert "segment" in [event["event"] for event in run.events]
     assert np.all(np.diff(run.rows["cycle"]) == 1)
     bench.desk.ask_to_record("watch")
+    bench.until(lambda: bench.status.recording.run != "")  # a thread makes its folder
     for _ in range(20):
         bench.loop.step()
     bench.desk.ask_to_record("")
-    bench.loop.step()
+    bench.until(lambda: bench.status.recording.run == "")
     (asked,) = runs_of(bench, "watch")
     assert 100 < read_run(asked).rows.size < 2000
 
@@ -310,26 +456,120 @@ def test_a_list_of_runs_need_not_read_what_is_just_recorded(tmp_path):
     session.begin_run("motion", "arm", 0)
     session.append(rows_from(0, 5000))
     session.flush()
+    quickly = RunList(tmp_path)
     counted = {run.folder.name.split("-")[-1]: run for run in list_runs(tmp_path)}
     assert (counted["motion"].state, counted["motion"].rows_count) == ("recording", 5000)
-    quick = {run.folder.name.split("-")[-1]: run for run in list_runs(tmp_path, count_under_way=False)}
+    quick = {run.folder.name.split("-")[-1]: run for run in asyncio.run(quickly.summaries())}
     assert (quick["motion"].state, quick["motion"].rows_count) == ("recording", 0)
     session.close()
-    closed = {run.folder.name.split("-")[-1]: run for run in list_runs(tmp_path, count_under_way=False)}
+    closed = {run.folder.name.split("-")[-1]: run for run in asyncio.run(quickly.summaries())}
     assert (closed["motion"].state, closed["motion"].rows_count) == ("closed", 5000)
 
 
-def test_a_window_of_the_session_is_a_run_of_its_own(tmp_path):
+def test_however_many_ask_for_the_runs_each_is_read_once(tmp_path):
+    for number in range(80):
+        made_run(tmp_path, f"2026-01-{number:03d}", 0.0, about="x" * 50_000)
+    quickly = RunList(tmp_path)
+
+    async def ask(count: int):
+        return await asyncio.gather(*(quickly.summaries() for _ in range(count)))
+
+    before = bytes_read()
+    asked = asyncio.run(ask(8))
+    assert bytes_read() - before < 2 * sum(path.stat().st_size for path in tmp_path.glob("*/manifest.json"))
+    assert all(len(one) == 80 for one in asked)
+    ((before, *_),) = asyncio.run(ask(1))
+    manifest = json.loads((before.folder / MANIFEST).read_text())
+    manifest["end"] = {"stop": "LEASE"}
+    (before.folder / MANIFEST).write_text(json.dumps(manifest))
+    ((after, *_),) = asyncio.run(ask(1))
+    assert (before.stop, after.stop) == ("", "LEASE")
+
+
+def test_a_run_that_its_recorder_left_is_counted_once_and_listed_as_crashed(tmp_path):
+    quickly = RunList(tmp_path)
     session = flight(tmp_path)
+    session.begin_run("motion", "arm", 0)
+    session.append(rows_from(0, 5000))
+    session.flush()
+    assert [run.state for run in asyncio.run(quickly.summaries())] == ["recording", "recording"]
+    session.abandon()
+    crashed = {run.folder.name.split("-")[-1]: run for run in asyncio.run(quickly.summaries())}
+    assert (crashed["motion"].state, crashed["motion"].rows_count) == ("crashed", 5000)
+    before = bytes_read()
+    assert len(asyncio.run(quickly.summaries())) == 2
+    assert bytes_read() - before < 1000
+
+
+def test_a_window_of_the_session_is_a_run_of_its_own(tmp_path):
+    said = []
+    session = flight(tmp_path, said=said)
     for first in range(0, 300, 20):
         session.append(rows_from(first, 20))
     session.event("emergency", 250 * MS_NS, code=3)
-    saved = session.save_window("event", "reversal", 230, 270)
-    assert read_run(saved).rows["cycle"].tolist() == list(range(230, 270))
-    early = session.save_window("event", "reversal", -50, 210)
-    assert read_run(early).rows["cycle"].tolist() == list(range(200, 210))
-    assert session.save_window("event", "reversal", 0, 100) is None  # not kept any more
+    session.save_window("event", "reversal", "around", 230, 270)
+    session.save_window("early", "reversal", "around", -50, 210)
+    session.save_window("gone", "reversal", "around", 0, 100)  # not kept any more
     session.close()
+    cycles = {folder.name.split("-")[-1]: read_run(folder).rows["cycle"].tolist() for folder in run_folders(tmp_path)}
+    assert cycles == {"session": [], "event": list(range(230, 270)), "early": list(range(200, 210))}
+    assert said == [("run", "around")] * 2
+
+
+def test_nothing_waits_for_the_disk_while_the_stage_moves(tmp_path, monkeypatch):
+    """Windows, runs on request and their ends: the stage's thread has a lease to renew meanwhile."""
+    slow, moves = threading.Event(), threading.Event()
+    fsync = os.fsync
+
+    def slowly(descriptor):
+        slow.set()
+        assert moves.wait(20.0), "the stage's thread waits for the disk"
+        fsync(descriptor)
+
+    session = flight(tmp_path)
+    session.append(rows_from(0, 100))
+    monkeypatch.setattr(os, "fsync", slowly)
+    session.save_last("fault", "LEASE", "the last")
+    assert slow.wait(20.0)
+    session.go_on_as("asked", "request")
+    session.append(rows_from(100, 50))
+    assert session.run_folder is None  # its folder is not there yet
+    moves.set()
+    first = record_until_it_goes_on(session, 150)
+    assert session.trigger == "request"
+    moves.clear()
+    session.go_on_as("arm", "arm", {"stop": "OPERATOR"})
+    session.append(rows_from(first, 50))
+    moves.set()
+    end = record_until_it_goes_on(session, first + 50)
+    assert session.trigger == "arm"
+    session.close()
+    (last,), (asked,), (armed,) = (tmp_path.glob(f"*-{name}") for name in ("fault", "asked", "arm"))
+    assert read_run(last).rows["cycle"].tolist() == list(range(100))
+    cycles = np.concatenate([read_run(asked).rows, read_run(armed).rows])["cycle"].tolist()
+    assert cycles == list(range(cycles[0], end))
+    assert read_run(asked).manifest["end"] == {"stop": "OPERATOR", "continued_by": armed.name}
+
+
+def test_a_run_that_was_asked_for_ends_also_before_it_is_there(tmp_path):
+    session = flight(tmp_path)
+    session.go_on_as("asked", "request")
+    session.end_run()
+    for first in range(0, 100, 10):
+        session.append(rows_from(first, 10))
+    session.close()
+    assert [folder.name for folder in run_folders(tmp_path)] == [session.folder.name]
+
+
+def test_an_arming_finds_the_run_that_was_asked_for(tmp_path):
+    session = flight(tmp_path)
+    session.go_on_as("asked", "request")
+    session.begin_run("arm", "arm", 0)
+    session.append(rows_from(0, 10))
+    assert session.trigger == "request"
+    session.close()
+    (asked,) = tmp_path.glob("*-asked")
+    assert read_run(asked).rows["cycle"].tolist() == list(range(10))
 
 
 def test_what_is_around_an_event_is_recorded_as_often_as_asked(tmp_path):
