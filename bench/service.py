@@ -1,13 +1,16 @@
 """The service under faults: seeded runs in virtual time and with real processes, losses, pages, soak, mutants.
 
 `--seed N` plays one run of the batch campaign and says what was seen; `--part NAME` does one part. Without `--full`
-the parts take 15 minutes together; with it, an interrupted campaign goes on where its journal ends.
+the parts take 15 minutes together on a host of their own: every kind of fault in virtual time, ten runs with real
+processes, every fourth mutant; the last figure says how long they took. With it, an interrupted campaign goes on where
+its journal ends.
 """
 
+import time
 from collections.abc import Callable, Iterator
 
 from bench import service_batch, service_mutants, service_processes, ten_pages
-from bench.figure import Figure
+from bench.figure import Bar, Figure, judged
 
 ABOUT = (
     "Faults are injected in the rig, over the wire; judges read the rig's own log (`tests/faults/judge.py`). "
@@ -25,6 +28,7 @@ PARTS: dict[str, Callable[..., Iterator[Figure]]] = {
     "soak": service_processes.soak_figures,
 }
 """By the name that `--part` takes."""
+TIME, TIME_FULL = Bar("all parts together", "s", 900.0), Bar("all parts together", "s")
 
 
 def figures(*, full: bool, say: Say, seed: int | None = None, part: str | None = None) -> Iterator[Figure]:
@@ -35,7 +39,12 @@ def figures(*, full: bool, say: Say, seed: int | None = None, part: str | None =
         return
     if part is not None and part not in PARTS:
         raise SystemExit(f"bench service --part {part}: choose from {', '.join(PARTS)}")
+    begin_s, took = time.monotonic(), []
     for name, measure in PARTS.items():
         if part in (None, name):
             say(name)
+            part_begin_s = time.monotonic()
             yield from measure(full=full, say=say)
+            took.append(f"{name} {time.monotonic() - part_begin_s:.0f} s")
+    if part is None:
+        yield judged(TIME_FULL if full else TIME, time.monotonic() - begin_s, reason=", ".join(took))

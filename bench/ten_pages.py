@@ -49,8 +49,8 @@ WITH_LOAD = Bar("missed cycles with a Chromium of another page, no client", "1/m
 WITH_PAGES = Bar("missed cycles with ten pages", "1/min")
 WITHOUT_PAGES = Bar("missed cycles without", "1/min")
 
-PAIRS, PAIRS_FULL = 8, 30
-WINDOW_S, WINDOW_FULL_S = 10.0, 20.0
+PAIRS, PAIRS_FULL = 6, 30
+WINDOW_S, WINDOW_FULL_S = 6.0, 20.0
 SETTLE_S = 2.0
 LEVEL = 0.05
 CLIENTS_COUNT = 9

@@ -253,6 +253,7 @@ class Rig:
         answers: list[tuple[int, bytes]] = []
         if sync:
             self.syncs_count += 1
+            self.truth.note_sync(t_ns)
             for node, motor in zip(self.nodes, self._motors(), strict=False):
                 answers += node.on_sync(t_ns, *motor)
             self._plan()
@@ -315,11 +316,9 @@ class Rig:
             end_mean_m = (end_integral - last_end_integral) / span_s
         self._last_sample = (t_ns, macro_integral, end_integral)
         zeros = (interferometer.macro_zero_m, interferometer.end_zero_m)
-        self.truth.append(
-            t_ns,
-            sequence,
-            (macro_m, end_m, macro_m_per_s, end_m_per_s, macro_mean_m, end_mean_m, contact_n, macro_n, micro_n, *zeros),
-        )
+        states = (self._macro_drive.state, -1 if self.machine.micro is None else self._micro_drive.state)
+        motion = (macro_m, end_m, macro_m_per_s, end_m_per_s, macro_mean_m, end_mean_m)
+        self.truth.append(t_ns, sequence, (*motion, contact_n, macro_n, micro_n, *zeros, *states))
 
     @property
     def next_line_t_ns(self) -> int:

@@ -1,6 +1,7 @@
-"""What really happened, at every sample of the interferometer: the scoring's view, never the controller's."""
+"""What really happened, at every sample of the interferometer, and when SYNC came: never the controller's view."""
 
 from array import array
+from bisect import bisect_left
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ COLUMNS = (
     "micro_force_n",
     "macro_zero_m",  # position at which the laser's counter reads zero
     "end_zero_m",
+    "macro_drive_state",  # `drive_states.DriveState`
+    "micro_drive_state",  # -1: this stage has no micro
 )
 
 
@@ -31,6 +34,7 @@ class TruthLog:
         self._t_ns = array("q")
         self._sequence = array("q")
         self._values = array("d")
+        self._sync_t_ns = array("q")
 
     def append(self, t_ns: int, sequence: int, values: tuple[float, ...]) -> None:
         """Add a row; `values` in the order of `COLUMNS`."""
@@ -40,7 +44,12 @@ class TruthLog:
         if self._rows_limit is not None and len(self._t_ns) > 2 * self._rows_limit:
             self._forget(len(self._t_ns) - self._rows_limit)
 
+    def note_sync(self, t_ns: int) -> None:
+        """Add the instant of a SYNC."""
+        self._sync_t_ns.append(t_ns)
+
     def _forget(self, rows_count: int) -> None:
+        del self._sync_t_ns[: bisect_left(self._sync_t_ns, self._t_ns[rows_count])]
         del self._t_ns[:rows_count]
         del self._sequence[:rows_count]
         del self._values[: rows_count * len(COLUMNS)]
@@ -49,13 +58,14 @@ class TruthLog:
         return len(self._t_ns)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return t_ns, sequence (int64) and all `COLUMNS` (float64), one element a sample."""
+        """Return t_ns, sequence (int64) and all `COLUMNS` (float64), one element a sample, and `sync_t_ns` (int64)."""
         values = np.array(self._values, dtype=np.float64).reshape(-1, len(COLUMNS))
         found = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(COLUMNS)}
         return {
             "t_ns": np.array(self._t_ns, dtype=np.int64),
             "sequence": np.array(self._sequence, dtype=np.int64),
             **found,
+            "sync_t_ns": np.array(self._sync_t_ns, dtype=np.int64),
         }
 
     def write(self, path: str | Path) -> None:

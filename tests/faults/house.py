@@ -1,42 +1,42 @@
-"""A service with its rig, all processes of their own, and an operator's program that holds its lease and its key."""
+"""A service with its rig, all processes of their own, and an operator's program that holds its lease and its key.
+
+It records as profiles do that say nothing of it: from arming to disarming.
+"""
 
 import contextlib
 import os
 import threading
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 
 from stagectl.backend import ask_rig
 from stagectl.client import Client
-from stagectl.errors import JogOver, LinkError, StagectlError
+from stagectl.errors import JogOver, LinkError, RequestError, StagectlError
+from stagectl.service import messages
+from tests.faults.witness import seen_of
 from tests.service.daemon import PATIENT, Daemon
 
-CHANGES = {**PATIENT, "record": {"when": "always"}}
+CHANGES = {**PATIENT, "macro.homing.speed_m_per_s": 0.1, "macro.homing.acceleration_m_per_s2": 0.5}
 LOOK_S = 0.02
 JOG_M_PER_S = 0.12
-_PATIENCE_S = 120.0  # a homing at 20 mm/s on a busy host is in it
-
-
-@dataclass
-class Seen:
-    """The true motion of a run, as often as the rig was asked."""
-
-    t_ns: list[int] = field(default_factory=list)
-    position_m: list[float] = field(default_factory=list)
-    velocity_m_per_s: list[float] = field(default_factory=list)
-    drive: list[str] = field(default_factory=list)
+IDENTIFY_S = 4.0
+_PATIENCE_S = 120.0
+_UNDER_WAY_S = 10.0
+_HOME_FROM_M = 0.08  # 0.8 s of search
 
 
 class House:
     """A service of its own with its rig; made anew by `systemd` where it was killed."""
 
-    def __init__(self, folder: Path, runs: Path | None = None):
-        """Start the service below `folder`; its runs may go elsewhere."""
-        self.daemon = Daemon(folder, CHANGES, runs)
-        self.seen = Seen()
+    def __init__(
+        self, folder: Path, runs: Path | None = None, profile: str = "single-axis", changes: dict | None = None
+    ):
+        """Start the service below `folder`, its runs elsewhere where told so, with more changes of the profile."""
+        self.daemon = Daemon(folder, {**CHANGES, **(changes or {})}, runs, profile)
+        self.seen: dict[str, np.ndarray] = {}
         self.accepted: list[str] = []
         self._jogging = threading.Event()
         self._over = threading.Event()
@@ -55,13 +55,26 @@ class House:
         self._channel = str(places[-1])
 
     def state(self) -> dict:
-        """Ask the rig what is true, and note it."""
-        found = ask_rig(self._channel, {"state": True})
-        self.seen.t_ns.append(found["t_ns"])
-        self.seen.position_m.append(found["plant"]["macro_position_m"])
-        self.seen.velocity_m_per_s.append(found["plant"]["macro_velocity_m_per_s"])
-        self.seen.drive.append(found["drives"]["1"])
-        return found
+        """Ask the rig what is true now."""
+        return ask_rig(self._channel, {"state": True})
+
+    @staticmethod
+    def t_ns() -> int:
+        """Return the time that rig and servo count in."""
+        return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+
+    def look_back(self) -> dict[str, np.ndarray]:
+        """Ask the rig for all that it saw, and keep it."""
+        path = self.daemon.folder / "seen.npz"
+        ask_rig(self._channel, {"truth": str(path)})
+        with np.load(path) as stored:
+            self.seen = seen_of({name: stored[name] for name in stored.files})
+        return self.seen
+
+    @property
+    def speed_m_per_s(self) -> float:
+        """How fast the macro truly is."""
+        return abs(self.state()["plant"]["macro_velocity_m_per_s"])
 
     def rig_fault(self, **fault) -> None:
         """Let something go wrong in the rig."""
@@ -118,17 +131,53 @@ class House:
                 except StagectlError:
                     return
 
-    def set_off(self) -> bool:
+    def set_off(self, speed_m_per_s: float = JOG_M_PER_S) -> bool:
         """Jog away from the nearer end until it truly moves; False where it does not get there."""
-        at_m = self.state()["plant"]["macro_position_m"]
-        self._speed_m_per_s = -JOG_M_PER_S if at_m > 0.0 else JOG_M_PER_S
+        self._speed_m_per_s = -self._side() * speed_m_per_s
         self._jogging.set()
-        give_up_s = time.monotonic() + 10.0
+        return self._until(lambda: self.speed_m_per_s > 0.95 * speed_m_per_s)
+
+    def _side(self) -> float:
+        return 1.0 if self.state()["plant"]["macro_position_m"] > 0.0 else -1.0
+
+    def _until(self, done) -> bool:
+        give_up_s = time.monotonic() + _UNDER_WAY_S
         while time.monotonic() < give_up_s:
-            if abs(self.state()["plant"]["macro_velocity_m_per_s"]) > 0.95 * JOG_M_PER_S:
+            if done():
                 return True
             time.sleep(LOOK_S)
         return False
+
+    def begin(self, phase: str, speed_m_per_s: float, target_m: float) -> str:
+        """Bring an armed stage into a phase of its work; return what stands in the way.
+
+        Its command is under way then, not its end: where in the phase the fault strikes is for who strikes.
+        """
+        client = self.daemon.client
+        try:
+            if phase == "jogging":
+                return "" if self.set_off(speed_m_per_s) else "it does not move"
+            if phase == "moving":
+                client.begin("move", messages.Move(target_m=-self._side() * target_m))
+            elif phase == "identifying":
+                client.begin("identify", messages.Identify(duration_s=IDENTIFY_S))
+            elif phase == "homing":
+                client.move(-self._side() * _HOME_FROM_M)
+                client.begin("home", messages.Home())
+            elif phase == "stopping":
+                if not self.set_off(speed_m_per_s):
+                    return "it does not move"
+                self.let_go()
+                client.stop()
+            elif phase in ("idle", "arming"):
+                client.stop()
+                if not self._until(lambda: client.status().state in ("idle", "fault")):
+                    return f"no rest: {client.status().state}"
+                if phase == "arming":
+                    client.begin("arm", messages.Arm())
+        except RequestError as error:
+            return str(error)
+        return ""
 
     def let_go(self) -> None:
         """Hold no key any more."""
@@ -141,13 +190,14 @@ class House:
 
     # ---- judging -------------------------------------------------------------------------------------------------
 
-    def lateness_s(self, since_t_ns: int) -> float:
-        """Return how late the servo was at worst after an instant, by the runs' rows."""
+    def lateness_s(self, since_t_ns: int, until_t_ns: int) -> float:
+        """Return how late the servo was at worst between two instants, by the runs' rows."""
         worst = 0
         for path in self.daemon.runs.glob("*/samples.arrow"):
             with contextlib.suppress(pa.ArrowException, OSError), pa.OSFile(str(path)) as file:
                 reader = pa.ipc.open_stream(file)
                 for batch in reader:
-                    late = batch.column("lateness_ns").to_numpy()[batch.column("t_ns").to_numpy() >= since_t_ns]
+                    t_ns = batch.column("t_ns").to_numpy()
+                    late = batch.column("lateness_ns").to_numpy()[(t_ns >= since_t_ns) & (t_ns <= until_t_ns)]
                     worst = max(worst, int(late.max(initial=0)))
         return 1e-9 * worst

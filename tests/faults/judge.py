@@ -4,9 +4,14 @@ The macro may go, from the fault on,
 
     v t + a t^2 / 2 + (v + a t)^2 / (2 ramp)
 
-with v and a true at that instant and t the detection time and one cycle. Where commands still arrive while the fault
-is not yet noticed, the planned motion goes on: a is the greatest gain of speed that was truly seen within t, and
-never more than a plan may reach in it. A macro without power has the way to its end stops instead.
+with v and a true at that instant and t the detection time and one cycle, with real processes also what the host held
+servo or rig up. Until the fault is noticed the planned motion goes on, or the drive keeps the force that balanced
+magnets and cables at one place: a is the greatest gain of speed that was truly seen within t, and never more than a
+plan may reach in it, or those forces may change by.
+
+A macro without power coasts: it has the way to its end stops instead, and may nowhere be faster than the guard lets it
+be where its power went, and what magnets and cables give it on the way. A micro without power has its winding shorted:
+from where its power went on it is computed how far such a one goes beside this macro, and it may go no further.
 
 Rest is |v| < 1 mm/s, also for an axis that loses its power: one that is let go of faster has not come to rest, and
 its way goes on counting. From rest on a drive holds on its encoder. Its loop needs 0.2 s until it stands; that way is
@@ -25,12 +30,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tests.faults.kinds import CYCLE_S, MACRO, Drawn
-from tests.faults.scene import Facts
+from tests.faults.kinds import CYCLE_S, MACRO, MICRO, Drawn
+from tests.faults.limp import shorted_way_m
+from tests.faults.mechanics import Mechanics, mechanics_of
+from tests.faults.scene import PROFILE, Facts
 from tests.faults.witness import ENABLED, STOPPING
 
-RAMP_M_PER_S2 = 2.0  # the drive's, 0x6085
-PLAN_M_PER_S2, PLAN_M_PER_S3 = 0.9, 9.0  # what moves of this profile are planned with
 REST_M_PER_S = 1e-3
 STANDSTILL_M = 20e-6  # a drive that holds on its encoder gives way so far when a force changes
 REST_SAMPLES = 20
@@ -40,16 +45,24 @@ RELEASED_SAMPLES = 500  # the same, where an obstacle had pushed it millimetres 
 OVERSHOOT = 0.2  # of the way back
 SLOPE_SAMPLES = 10  # over which an acceleration is taken
 BEGUN_CYCLES = 2
-STOPS_M = (-0.50, 0.50)  # the machine's
 STOPS_GIVE_M = 8e-3
+SPEED_SHARE = 1.02  # of what the guard allows: its own speed is filtered
+LIMP_SHARE, LIMP_M = (
+    1.03,
+    10e-6,
+)  # of the computed way; in motion it is met to 0.1 %, a winding left open goes 16 % beyond
 _POWERED = (ENABLED, *STOPPING)
+AT_WILL = ("idle", "arming", "stopping")  # phases in which a fault may go by
 _LAW_STOPS, _ENDED = 5, (5, 6, 7, 8)  # run_phase
 
 TRAVEL, STANDSTILL = "travel beyond the bound", "followed a command after standstill"
 BEGUN, LOST, UNREADABLE = "stop begun late", "recorded cycles lost", "run unreadable"
 STRANGER, BACK, COURSE = "unauthorised command accepted", "not armed again", "went on, or stopped without need"
-BARS = (TRAVEL, STANDSTILL, BEGUN, LOST, UNREADABLE, STRANGER, BACK, COURSE)
+STRUCK, LIMP = "macro without power too fast", "micro without power too far"
+BARS = (TRAVEL, STRUCK, LIMP, STANDSTILL, BEGUN, LOST, UNREADABLE, STRANGER, BACK, COURSE)
 """What a run can miss."""
+GENTLE = "a: the greatest gain of speed until it was noticed, at most a plan's; behind an obstacle forward only"
+"""Where the bound differs from v t + a t^2 / 2 + (v + a t)^2 / (2 ramp) with what was true at the fault."""
 
 
 @dataclass(frozen=True)
@@ -113,24 +126,28 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     return {name: table.column(name).to_numpy() for name in _WANTED}
 
 
-def judge(drawn: Drawn, facts: Facts, record: Record) -> Verdict:
-    """Hold one run against every bar."""
+def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = None) -> Verdict:
+    """Hold one run against every bar; `of`: the stage, the campaign's where None."""
+    of = of or mechanics_of(PROFILE)
     seen = facts.seen
     t_ns, velocity, position = seen["t_ns"], seen["macro_velocity_m_per_s"], seen["macro_position_m"]
     noticed = record.noticed_t_ns(facts.fault_t_ns)
     noticed = noticed if noticed is not None and noticed < facts.judged_until_t_ns else None
     stopped = bool(facts.fault_kind) or noticed is not None
     found: list[tuple[str, str]] = []
-    if drawn.must_stop and not facts.fault_kind and facts.phase != "stopping":
+    if drawn.must_stop and not facts.fault_kind and facts.phase not in AT_WILL:
         found.append((COURSE, "it went on"))
     if not drawn.may_stop and facts.fault_kind:
         found.append((COURSE, f"stopped by {facts.fault_kind}"))
     travel_m = bound_m = begun = drift_m = 0.0
     end = rests = int(np.searchsorted(t_ns, facts.judged_until_t_ns))
-    if not facts.fault_kind and facts.phase == "stopping":  # a homing takes power away and gives it again
+    if not facts.fault_kind and facts.phase in ("stopping", "idle"):  # a homing takes power away and gives it again
         at = int(np.searchsorted(t_ns, facts.fault_t_ns))
         found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
-    if facts.fault_kind:
+    if facts.fault_kind and not _had_power(seen, facts.fault_t_ns, noticed, end):
+        at = int(np.searchsorted(t_ns, facts.fault_t_ns))
+        found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
+    elif facts.fault_kind:
         counts_from, detection_s = facts.fault_t_ns, drawn.detection_s
         if not np.isfinite(detection_s):
             counts_from, detection_s = noticed or facts.fault_t_ns, CYCLE_S
@@ -147,13 +164,21 @@ def judge(drawn: Drawn, facts: Facts, record: Record) -> Verdict:
         else:
             away_m = np.abs(position[at:stands] - position[at])
         travel_m = float(away_m.max(initial=0.0))
-        bound_m = _way_to_stops_m(velocity, position, at) if dark else _bound_m(t_ns, velocity, at, detection_s)
-        bound_m += back_m
+        if dark:
+            bound_m = _way_to_stops_m(velocity, position, at, of)
+            found += _too_fast(seen, at, stands, of)
+        else:
+            bound_m = back_m + _bound_m(t_ns, velocity, at, detection_s + facts.late_s, of, drawn.open_loop)
+        if MICRO in drawn.without_power:
+            found += _too_far(seen, at, stands, of)
         if not travel_m <= bound_m + STANDSTILL_M:
             found.append((TRAVEL, f"macro went {travel_m * 1e3:.3f} mm, bound {bound_m * 1e3:.3f} mm"))
         if rest is None and not dark:
             found.append((STANDSTILL, "it never stood still"))
-        found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
+        asked_at = at  # an arming, or a homing, gives power until the fault is noticed
+        if facts.phase in ("arming", "homing"):
+            asked_at = end if noticed is None else int(np.searchsorted(t_ns, noticed))
+        found += [(STANDSTILL, text) for text in _enabled_again(seen, asked_at, end)]
         held_m, drift_m = _moved_after(seen, stands, end)
         if rest is not None and not drawn.pushed:
             settled_m = float(np.abs(position[rest:stands] - position[rest]).max(initial=0.0))
@@ -175,7 +200,9 @@ def judge(drawn: Drawn, facts: Facts, record: Record) -> Verdict:
     return Verdict(tuple(found), stopped, travel_m, bound_m, begun, lost, drift_m)
 
 
-def _bound_m(t_ns: np.ndarray, velocity: np.ndarray, at: int, detection_s: float) -> float:
+def _bound_m(
+    t_ns: np.ndarray, velocity: np.ndarray, at: int, detection_s: float, of: Mechanics, open_loop: bool = False
+) -> float:
     """Return how far the macro may go from sample `at` on."""
     before = max(at - SLOPE_SAMPLES, 0)
     span_s = 1e-9 * float(t_ns[at] - t_ns[before]) or CYCLE_S
@@ -184,16 +211,31 @@ def _bound_m(t_ns: np.ndarray, velocity: np.ndarray, at: int, detection_s: float
     until = max(int(np.searchsorted(t_ns, t_ns[at] + round(1e9 * t))), at + 1)
     speed = np.abs(velocity[before:until])
     gained = float(((speed[SLOPE_SAMPLES:] - speed[:-SLOPE_SAMPLES]) / (SLOPE_SAMPLES * CYCLE_S)).max(initial=0.0))
-    a = max(a, min(a + PLAN_M_PER_S3 * t, PLAN_M_PER_S2, gained))
+    most = a + of.drift_m_per_s2 if open_loop else min(a + of.plan_m_per_s3 * t, of.plan_m_per_s2)
+    a = max(a, min(most, gained))
     v = abs(float(velocity[at]))
-    return v * t + 0.5 * a * t * t + (v + a * t) ** 2 / (2.0 * RAMP_M_PER_S2)
+    return v * t + 0.5 * a * t * t + (v + a * t) ** 2 / (2.0 * of.ramp_m_per_s2)
 
 
-def _way_to_stops_m(velocity: np.ndarray, position: np.ndarray, at: int) -> float:
+def _way_to_stops_m(velocity: np.ndarray, position: np.ndarray, at: int, of: Mechanics) -> float:
     """Return the way of an axis without power: to the stop that it coasts to."""
-    low_m, high_m = STOPS_M
+    low_m, high_m = of.machine.macro.travel_m
     way_m = high_m - position[at] if velocity[at] > 0.0 else position[at] - low_m
     return float(way_m) + STOPS_GIVE_M
+
+
+def _too_fast(seen: dict[str, Any], at: int, end: int, of: Mechanics) -> list[tuple[str, str]]:
+    """Return where a macro without power was faster than the guard lets it be, and what it rolls down to."""
+    allowed = SPEED_SHARE * of.coasting_m_per_s(seen["macro_position_m"][at], seen["macro_velocity_m_per_s"][at])
+    fastest = float(np.abs(seen["macro_velocity_m_per_s"][at : max(end, at + 1)]).max())
+    return [] if fastest <= allowed else [(STRUCK, f"{fastest:.3f} m/s, the guard allows {allowed:.3f}")]
+
+
+def _too_far(seen: dict[str, Any], at: int, end: int, of: Mechanics) -> list[tuple[str, str]]:
+    """Return where a micro without power went further, relative to the macro, than its shorted winding lets it."""
+    allowed_m = LIMP_SHARE * shorted_way_m(of.machine, seen, at, end) + LIMP_M
+    went_m = float(np.abs(seen["end_position_m"][at:end] - seen["macro_position_m"][at:end]).max(initial=0.0))
+    return [] if went_m <= allowed_m else [(LIMP, f"{went_m * 1e6:.0f} um, computed {allowed_m * 1e6:.0f}")]
 
 
 def _rest(seen: dict[str, Any], at: int, end: int, noticed_t_ns: int | None) -> int | None:
@@ -210,6 +252,13 @@ def _rest(seen: dict[str, Any], at: int, end: int, noticed_t_ns: int | None) -> 
     let_go = ~np.isin(states[first:], _POWERED) & (np.abs(velocity[first:]) < REST_M_PER_S)
     found += np.flatnonzero(let_go)[:1].tolist()
     return at + first + min(found) if found else None
+
+
+def _had_power(seen: dict[str, Any], fault_t_ns: int, noticed_t_ns: int | None, end: int) -> bool:
+    """Tell whether the macro had power at the fault, or got it until that was noticed; without it is free to roll."""
+    at = max(int(np.searchsorted(seen["t_ns"], fault_t_ns)) - 1, 0)
+    until = end if noticed_t_ns is None else int(np.searchsorted(seen["t_ns"], noticed_t_ns))
+    return bool(np.isin(seen["states"][at : until + 1, 0], _POWERED).any())
 
 
 def _enabled_again(seen: dict[str, Any], at: int, end: int) -> list[str]:

@@ -27,6 +27,9 @@ _LEASE_S = 2.0  # what a lease lasts that nobody renews
 FRAME_S = 130e-6  # eight bytes at 1 Mbit/s
 NEVER_S = float("inf")
 
+NONSENSE = ("", "name = 3\n", 'name = "x"\n[macro]\nmass_kg = nan\n', "\x00\xff not a profile", "[macro\n")
+"""No profiles; characters of one byte."""
+
 MOVING = ("accelerating", "constant speed", "decelerating")
 PHASES = ("at rest", *MOVING, "jogging", "identifying", "homing", "stopping")
 
@@ -43,23 +46,25 @@ class Drawn:
     detection_s: float = NEVER_S  # NEVER_S: from the instant that the controller says it noticed
     lasts_s: float = 0.0
     without_power: tuple[int, ...] = ()  # nodes that can't brake
+    open_loop: bool = False  # the drive keeps its last force until the fault is noticed
     pushed: bool = False  # by something that is no command: how far is not judged
 
 
 Draw = Callable[[np.random.Generator, str], Drawn]
 
 
-def _of(rng: np.random.Generator, values):
+def one_of(rng: np.random.Generator, values):
+    """Draw one of the values."""
     return values[int(rng.integers(len(values)))]
 
 
-def _between(rng: np.random.Generator, low: float, high: float) -> float:
+def between(rng: np.random.Generator, low: float, high: float) -> float:
     """Draw evenly in the logarithm."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 def _lost(rng: np.random.Generator, ids: tuple[int, ...], low_s: float, detection_s: float, what: str) -> Drawn:
-    can_id, duration_s = _of(rng, ids), _between(rng, low_s, 0.6)
+    can_id, duration_s = one_of(rng, ids), between(rng, low_s, 0.6)
     fault = Fault("drop_frame", can_id=can_id, duration_s=duration_s)
     must = duration_s > detection_s + 0.01
     return Drawn(
@@ -77,13 +82,13 @@ def frames_lost(rng: np.random.Generator, phase: str) -> Drawn:
 
 def few_frames_lost(rng: np.random.Generator, phase: str) -> Drawn:
     ids = (*CYCLIC, 0x081, 0x082, 0x281, 0x282)
-    can_id, count = _of(rng, ids), int(rng.integers(1, 4))
+    can_id, count = one_of(rng, ids), int(rng.integers(1, 4))
     fault = Fault("drop_frame", can_id=can_id, count=count, duration_s=0.3)
     return Drawn(f"{count} frames 0x{can_id:03X} lost", (fault,), must_stop=False, lasts_s=0.3)
 
 
 def frames_late(rng: np.random.Generator, phase: str) -> Drawn:
-    can_id, delay_s, duration_s = _of(rng, CYCLIC), _between(rng, 3e-4, 8e-3), _between(rng, 0.01, 0.3)
+    can_id, delay_s, duration_s = one_of(rng, CYCLIC), between(rng, 3e-4, 8e-3), between(rng, 0.01, 0.3)
     fault = Fault("delay_frame", can_id=can_id, delay_s=delay_s, duration_s=duration_s)
     text = f"frame 0x{can_id:03X} late by {delay_s * 1e3:.1f} ms for {duration_s * 1e3:.0f} ms"
     return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
@@ -91,14 +96,14 @@ def frames_late(rng: np.random.Generator, phase: str) -> Drawn:
 
 def frames_reordered(rng: np.random.Generator, phase: str) -> Drawn:
     """By one to three frames' time: an RPDO comes behind its SYNC, a TPDO behind the other's."""
-    can_id, delay_s, duration_s = _of(rng, (*TPDOS, *RPDOS)), _between(rng, 1e-4, 3e-4), _between(rng, 0.01, 0.5)
+    can_id, delay_s, duration_s = one_of(rng, (*TPDOS, *RPDOS)), between(rng, 1e-4, 3e-4), between(rng, 0.01, 0.5)
     fault = Fault("delay_frame", can_id=can_id, delay_s=delay_s, duration_s=duration_s)
     text = f"frame 0x{can_id:03X} behind its followers for {duration_s * 1e3:.0f} ms"
     return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
 
 
 def frames_doubled(rng: np.random.Generator, phase: str) -> Drawn:
-    can_id, duration_s = _of(rng, CYCLIC), _between(rng, 0.01, 0.5)
+    can_id, duration_s = one_of(rng, CYCLIC), between(rng, 0.01, 0.5)
     fault = Fault("duplicate_frame", can_id=can_id, duration_s=duration_s)
     return Drawn(
         f"frame 0x{can_id:03X} doubled for {duration_s * 1e3:.0f} ms", (fault,), must_stop=False, lasts_s=duration_s
@@ -107,28 +112,28 @@ def frames_doubled(rng: np.random.Generator, phase: str) -> Drawn:
 
 def frames_corrupted(rng: np.random.Generator, phase: str) -> Drawn:
     """Bits turn over behind the bus's own check: a gateway, a driver's bug."""
-    can_id, count = _of(rng, (*TPDOS, *RPDOS)), int(rng.integers(1, 6))
+    can_id, count = one_of(rng, (*TPDOS, *RPDOS)), int(rng.integers(1, 6))
     bits = sum(1 << int(k) for k in rng.choice(32, size=int(rng.integers(1, 4)), replace=False))
     fault = Fault("corrupt_frame", can_id=can_id, bits=bits, count=count, duration_s=0.1)
     return Drawn(f"{count} frames 0x{can_id:03X} with bits 0x{bits:08X}", (fault,), must_stop=False, lasts_s=0.1)
 
 
 def frames_short(rng: np.random.Generator, phase: str) -> Drawn:
-    can_id = _of(rng, (*TPDOS, *RPDOS))
+    can_id = one_of(rng, (*TPDOS, *RPDOS))
     length = int(rng.integers(0, 4))
     fault = Fault("short_frame", can_id=can_id, length_count=length, duration_s=0.05)
     return Drawn(f"frame 0x{can_id:03X} of {length} bytes", (fault,), detection_s=AT_ONCE_S, lasts_s=0.05)
 
 
 def bus_off(rng: np.random.Generator, phase: str) -> Drawn:
-    duration_s = _between(rng, 0.01, 0.8)
+    duration_s = between(rng, 0.01, 0.8)
     fault = Fault("bus_off", duration_s=duration_s)
     return Drawn(f"bus-off for {duration_s * 1e3:.0f} ms", (fault,), detection_s=AT_ONCE_S, lasts_s=duration_s)
 
 
 def bus_full(rng: np.random.Generator, phase: str) -> Drawn:
     """A node with a better id talks: nothing else gets through, and the queue refuses (ENOBUFS)."""
-    count = round(_between(rng, 30, 3000))
+    count = round(between(rng, 30, 3000))
     duration_s = count * FRAME_S
     must = duration_s > 2.5 * SILENCE_S
     return Drawn(
@@ -141,20 +146,20 @@ def bus_full(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def emergency(rng: np.random.Generator, phase: str) -> Drawn:
-    node_id, code = _of(rng, (MACRO, MICRO)), _of(rng, (0x2310, 0x3210, 0x4210, 0x7305, 0x8611))
+    node_id, code = one_of(rng, (MACRO, MICRO)), one_of(rng, (0x2310, 0x3210, 0x4210, 0x7305, 0x8611))
     fault = Fault("emergency", node_id=node_id, code=code)
     return Drawn(f"EMCY 0x{code:04X} of node {node_id}", (fault,), detection_s=AT_ONCE_S)
 
 
 def statusword_stuck(rng: np.random.Generator, phase: str) -> Drawn:
-    node_id, duration_s = _of(rng, (MACRO, MICRO)), _between(rng, 0.05, 1.0)
+    node_id, duration_s = one_of(rng, (MACRO, MICRO)), between(rng, 0.05, 1.0)
     fault = Fault("stuck_statusword", node_id=node_id, duration_s=duration_s)
     text = f"statusword of node {node_id} stuck for {duration_s * 1e3:.0f} ms"
     return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
 
 
 def drive_reboot(rng: np.random.Generator, phase: str) -> Drawn:
-    node_id, duration_s = _of(rng, (MACRO, MICRO)), _between(rng, 0.03, 1.0)
+    node_id, duration_s = one_of(rng, (MACRO, MICRO)), between(rng, 0.03, 1.0)
     fault = Fault("power_loss", node_id=node_id, duration_s=duration_s)
     text = f"node {node_id} dark for {duration_s * 1e3:.0f} ms, then boots"
     return Drawn(text, (fault,), detection_s=SILENCE_S, lasts_s=duration_s, without_power=(node_id,))
@@ -173,8 +178,8 @@ def mapping_changed(rng: np.random.Generator, phase: str) -> Drawn:
 
     Another mode shows where something is to move; at rest the drive holds, and a homing writes the mode itself.
     """
-    what, index, subindex, value = _of(rng, _CHANGES)
-    node_id = MACRO if index in (0x1A00, 0x6060) else _of(rng, (MACRO, MICRO))
+    what, index, subindex, value = one_of(rng, _CHANGES)
+    node_id = MACRO if index in (0x1A00, 0x6060) else one_of(rng, (MACRO, MICRO))
     if index in (0x1400, 0x1800):
         value |= node_id
     fault = Fault("object_change", node_id=node_id, index=index, subindex=subindex, value=value)
@@ -184,7 +189,7 @@ def mapping_changed(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def drive_heartbeat_lost(rng: np.random.Generator, phase: str) -> Drawn:
-    node_id, duration_s = _of(rng, (MACRO, MICRO)), _between(rng, 0.05, 1.0)
+    node_id, duration_s = one_of(rng, (MACRO, MICRO)), between(rng, 0.05, 1.0)
     must = duration_s > _HEARTBEAT_S + 0.1
     return Drawn(
         f"no heartbeat of node {node_id} for {duration_s * 1e3:.0f} ms",
@@ -201,7 +206,7 @@ def master_heartbeat_lost(rng: np.random.Generator, phase: str) -> Drawn:
 
 def encoder_glitch(rng: np.random.Generator, phase: str) -> Drawn:
     """Counts appear from nowhere; what is less than 50 um and a period's way is not told apart from jitter."""
-    offset_m, duration_s = _between(rng, 5e-6, 5e-3) * _of(rng, (-1.0, 1.0)), _between(rng, 1e-3, 0.5)
+    offset_m, duration_s = between(rng, 5e-6, 5e-3) * one_of(rng, (-1.0, 1.0)), between(rng, 1e-3, 0.5)
     must = abs(offset_m) > 1.2e-3 and duration_s > 0.03
     return Drawn(
         f"macro encoder off by {offset_m * 1e6:.0f} um for {duration_s * 1e3:.0f} ms",
@@ -213,7 +218,7 @@ def encoder_glitch(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def beam_break(rng: np.random.Generator, phase: str) -> Drawn:
-    axis, duration_s = _of(rng, ("macro", "end", "both")), _between(rng, 2e-3, 0.8)
+    axis, duration_s = one_of(rng, ("macro", "end", "both")), between(rng, 2e-3, 0.8)
     fault = Fault("beam_loss", axis=axis, duration_s=duration_s)
     return Drawn(
         f"no beam on {axis} for {duration_s * 1e3:.0f} ms", (fault,), detection_s=AT_ONCE_S, lasts_s=duration_s
@@ -221,7 +226,7 @@ def beam_break(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def sensor_silence(rng: np.random.Generator, phase: str) -> Drawn:
-    duration_s = _between(rng, 1e-3, 0.8)
+    duration_s = between(rng, 1e-3, 0.8)
     must = duration_s > SILENCE_S + 5e-3
     return Drawn(
         f"interferometer silent for {duration_s * 1e3:.0f} ms",
@@ -233,7 +238,7 @@ def sensor_silence(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def sensor_garbage(rng: np.random.Generator, phase: str) -> Drawn:
-    count = round(_between(rng, 1, 4000))
+    count = round(between(rng, 1, 4000))
     lines = int(rng.integers(0, 15))
     faults = [Fault("garbage", count=count)]
     faults += [Fault("half_line", at_s=k * CYCLE_S, length_count=int(rng.integers(0, 25))) for k in range(lines)]
@@ -241,7 +246,7 @@ def sensor_garbage(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def sequence_gap(rng: np.random.Generator, phase: str) -> Drawn:
-    count = round(_between(rng, 2, 5000))
+    count = round(between(rng, 2, 5000))
     return Drawn(f"{count} sequence numbers skipped", (Fault("sequence_gap", count=count),), detection_s=AT_ONCE_S)
 
 
@@ -250,7 +255,7 @@ def sensor_restart(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def counts_stuck(rng: np.random.Generator, phase: str) -> Drawn:
-    duration_s = _between(rng, 0.03, 0.8)
+    duration_s = between(rng, 0.03, 0.8)
     fault = Fault("stuck_counts", duration_s=duration_s)
     must = phase == "constant speed"
     return Drawn(
@@ -263,14 +268,14 @@ def counts_stuck(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def clock_drift(rng: np.random.Generator, phase: str) -> Drawn:
-    ppm, duration_s = _between(rng, 5.0, 2e4) * _of(rng, (-1.0, 1.0)), _between(rng, 0.1, 1.0)
+    ppm, duration_s = between(rng, 5.0, 2e4) * one_of(rng, (-1.0, 1.0)), between(rng, 0.1, 1.0)
     fault = Fault("clock_drift", ppm=ppm, duration_s=duration_s)
     text = f"interferometer's clock {ppm:.0f} ppm off for {duration_s * 1e3:.0f} ms"
     return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
 
 
 def unplugged(rng: np.random.Generator, phase: str) -> Drawn:
-    duration_s = _between(rng, 5e-3, 0.8)
+    duration_s = between(rng, 5e-3, 0.8)
     fault = Fault("unplug", duration_s=duration_s)
     text = f"interferometer unplugged for {duration_s * 1e3:.0f} ms"
     return Drawn(text, (fault,), detection_s=AT_ONCE_S, lasts_s=duration_s)
@@ -280,8 +285,8 @@ _INPUTS = (("limit switch", MACRO, 0x2), ("pressure low", MACRO, 0x1_0000), ("ST
 
 
 def input_trips(rng: np.random.Generator, phase: str) -> Drawn:
-    what, node_id, bits = _of(rng, _INPUTS)
-    duration_s = _between(rng, 0.1, 1.0)
+    what, node_id, bits = one_of(rng, _INPUTS)
+    duration_s = between(rng, 0.1, 1.0)
     fault = Fault("input", node_id=node_id, bits=bits, duration_s=duration_s)
     return Drawn(
         f"{what} of node {node_id} for {duration_s * 1e3:.0f} ms",
@@ -303,13 +308,13 @@ def edge_jump(rng: np.random.Generator, phase: str) -> Drawn:
 
 def obstacle(rng: np.random.Generator, phase: str) -> Drawn:
     """Something lies in the way of the macro: a following error."""
-    offset_m = _between(rng, 1e-3, 60e-3)
+    offset_m = between(rng, 1e-3, 60e-3)
     faults = tuple(Fault("obstacle", offset_m=side * offset_m, duration_s=1.5) for side in (-1.0, 1.0))
     return Drawn(f"obstacles {offset_m * 1e3:.0f} mm away", faults, must_stop=False, lasts_s=1.5, pushed=True)
 
 
 def host_held_up(rng: np.random.Generator, phase: str) -> Drawn:
-    duration_s = _between(rng, 5e-3, 0.5)
+    duration_s = between(rng, 5e-3, 0.5)
     must = duration_s > SILENCE_S + 2e-3
     return Drawn(
         f"host held up for {duration_s * 1e3:.0f} ms",

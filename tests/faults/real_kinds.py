@@ -1,4 +1,4 @@
-"""What is done to a service of real processes: each kind with how soon it must be noticed.
+"""What is done to a service of real processes, drawn from a seed: each kind with how soon it must be noticed.
 
 The profile's limits are those of a patient host (`tests.service.daemon.PATIENT`).
 """
@@ -8,7 +8,7 @@ import os
 import signal
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import httpx
@@ -18,42 +18,53 @@ from stagectl.client import Client
 from stagectl.errors import StagectlError
 from stagectl.service.access import Role, read_tokens
 from tests.faults.house import House
+from tests.faults.kinds import CYCLE_S, NEVER_S, NONSENSE, Drawn, between, one_of
 from tests.service.daemon import servo_pid
 
-CYCLE_S = 1e-3
+AT_ONCE_S = 3 * CYCLE_S
 SENSOR_S, RPDO_S, HEARTBEAT_S, LEASE_S, SUPERVISOR_S = 0.3, 0.1, 2.0, 2.0, 0.5  # as the profile has them
+_LOOKS_AWAY_S = 1.5
 DISK_S = 0.5  # rows go onto the disk every 0.25 s; the supervisor hears with the next ones that it took none
 _CASES_COUNT = 3  # of every operation of the API, with data that fit and with data that don't
 _NO_LEASE = ("/v1/record", "/v1/record/trigger")
 
 
 @dataclass(frozen=True)
-class Kind:
-    """One fault: what is done, how soon it must be noticed, what is left of the processes."""
+class Real:
+    """A fault as it was drawn, and what only processes have; its `act` is on a house."""
 
-    strike: Callable[[House], None]
-    detection_s: float = CYCLE_S
-    must_stop: bool = True
-    may_stop: bool = True
-    without_power: bool = False
-    lasts_s: float = 0.0
+    drawn: Drawn
     by_drives: bool = False  # the drives stop it by themselves: how late the servo was is no excuse
-    open_loop: bool = False  # the drive keeps its last force until the fault is noticed
     disk_bytes: int = 0  # of a disk of its own for the runs; 0 = none
 
 
-def killed_child(house: House) -> None:
+Draw = Callable[[np.random.Generator, Sequence[int]], Real]
+"""From a generator and the ids of the stage's nodes, macro first."""
+
+
+def killed_child(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
     """Kill the servo; the supervisor, with whom the rig would go, looks away until the drives have stopped it."""
-    supervisor = house.daemon.process.pid
-    os.kill(supervisor, signal.SIGSTOP)
-    _later(1.0, lambda: _go_on(supervisor))
-    os.kill(servo_pid(house.daemon), signal.SIGKILL)
+
+    def act(house: House) -> None:
+        supervisor = house.daemon.process.pid
+        os.kill(supervisor, signal.SIGSTOP)
+        _later(_LOOKS_AWAY_S, lambda: _go_on(supervisor))
+        os.kill(servo_pid(house.daemon), signal.SIGKILL)
+
+    return Real(Drawn("servo killed", act=act, detection_s=RPDO_S, open_loop=True), by_drives=True)
 
 
-def stopped_child(house: House) -> None:
-    pid = servo_pid(house.daemon)
-    os.kill(pid, signal.SIGSTOP)
-    _later(3.0, lambda: _go_on(pid))
+def stopped_child(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    duration_s = between(rng, 0.03, 3.5)
+
+    def act(house: House) -> None:
+        pid = servo_pid(house.daemon)
+        os.kill(pid, signal.SIGSTOP)
+        _later(duration_s, lambda: _go_on(pid))
+
+    text, must = f"servo stopped for {duration_s * 1e3:.0f} ms", duration_s > 1.5 * RPDO_S
+    fault = Drawn(text, act=act, must_stop=must, detection_s=RPDO_S, lasts_s=duration_s, open_loop=True)
+    return Real(fault, by_drives=True)
 
 
 def _later(delay_s: float, action: Callable[[], object]) -> None:
@@ -67,21 +78,148 @@ def _go_on(pid: int) -> None:
         os.kill(pid, signal.SIGCONT)
 
 
-def killed_supervisor(house: House) -> None:
+def _kill_supervisor(house: House) -> None:
     house.daemon.process.kill()
     house.daemon.process.wait()
 
 
-def stopped_supervisor(house: House) -> None:
-    pid = house.daemon.process.pid
-    os.kill(pid, signal.SIGSTOP)
-    _later(1.5, lambda: _go_on(pid))
+def killed_supervisor(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    return Real(Drawn("supervisor killed", act=_kill_supervisor, detection_s=SUPERVISOR_S))
 
 
-def killed_both(house: House) -> None:
-    servo = servo_pid(house.daemon)
-    os.kill(servo, signal.SIGKILL)
-    killed_supervisor(house)
+def stopped_supervisor(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    duration_s = float(rng.uniform(0.1, 1.5))
+
+    def act(house: House) -> None:
+        pid = house.daemon.process.pid
+        os.kill(pid, signal.SIGSTOP)
+        _later(duration_s, lambda: _go_on(pid))
+
+    must = duration_s > SUPERVISOR_S + 0.1
+    detection_s = SUPERVISOR_S if must else NEVER_S
+    text = f"supervisor stopped for {duration_s * 1e3:.0f} ms"
+    return Real(Drawn(text, act=act, must_stop=must, detection_s=detection_s, lasts_s=duration_s))
+
+
+def killed_both(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    def act(house: House) -> None:
+        os.kill(servo_pid(house.daemon), signal.SIGKILL)
+        _kill_supervisor(house)
+
+    return Real(Drawn("servo and supervisor killed", act=act, detection_s=RPDO_S, open_loop=True), by_drives=True)
+
+
+def client_vanishes(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    """A client's program ends while it holds the key."""
+    return Real(Drawn("client vanishes", act=lambda house: house.vanish(), detection_s=LEASE_S))
+
+
+def _of_rig(text: str, faults: dict, **known) -> Real:
+    return Real(
+        Drawn(text, act=lambda house: house.rig_fault(**faults), lasts_s=faults.get("duration_s", 0.0), **known)
+    )
+
+
+def beam_break(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    axis, duration_s = one_of(rng, ("macro", "end", "both")[: 1 if len(nodes) == 1 else 3]), between(rng, 5e-3, 0.8)
+    fault = {"kind": "beam_loss", "axis": axis, "duration_s": duration_s}
+    return _of_rig(f"no beam on {axis} for {duration_s * 1e3:.0f} ms", fault, detection_s=AT_ONCE_S)
+
+
+def unplugged(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    duration_s = between(rng, 0.02, 0.8)
+    text = f"interferometer unplugged for {duration_s * 1e3:.0f} ms"
+    return _of_rig(text, {"kind": "unplug", "duration_s": duration_s}, detection_s=AT_ONCE_S)
+
+
+def bus_off(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    duration_s = between(rng, 0.02, 0.8)
+    text = f"bus-off for {duration_s * 1e3:.0f} ms"
+    return _of_rig(text, {"kind": "bus_off", "duration_s": duration_s}, detection_s=AT_ONCE_S)
+
+
+def sensor_silence(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    duration_s = between(rng, 0.01, 0.8)
+    must = duration_s > SENSOR_S + 0.05
+    return _of_rig(
+        f"interferometer silent for {duration_s * 1e3:.0f} ms",
+        {"kind": "sensor_silence", "duration_s": duration_s},
+        must_stop=must,
+        detection_s=SENSOR_S if must else NEVER_S,
+        open_loop=True,
+    )
+
+
+def emergency(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    node_id, code = one_of(rng, nodes), one_of(rng, (0x2310, 0x3210, 0x4210, 0x7305, 0x8611))
+    fault = {"kind": "emergency", "node_id": node_id, "code": code}
+    return _of_rig(f"EMCY 0x{code:04X} of node {node_id}", fault, detection_s=AT_ONCE_S)
+
+
+def drive_reboot(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    node_id, duration_s = one_of(rng, nodes), between(rng, 0.05, 1.0)
+    fault = {"kind": "power_loss", "node_id": node_id, "duration_s": duration_s}
+    text = f"node {node_id} dark for {duration_s * 1e3:.0f} ms, then boots"
+    return _of_rig(text, fault, detection_s=SENSOR_S, without_power=(node_id,))
+
+
+def frames_lost(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    """Commands, answers, or the beat of both, on their way."""
+    node_id, base, duration_s = one_of(rng, nodes), one_of(rng, (0x200, 0x180, 0x080)), between(rng, 0.02, 0.8)
+    can_id = base if base == 0x080 else base + node_id
+    detection_s = SENSOR_S if base == 0x180 else RPDO_S
+    must = duration_s > detection_s + 0.05
+    return _of_rig(
+        f"frame 0x{can_id:03X} lost for {duration_s * 1e3:.0f} ms",
+        {"kind": "drop_frame", "can_id": can_id, "duration_s": duration_s},
+        must_stop=must,
+        detection_s=detection_s if must else NEVER_S,
+        open_loop=base != 0x180,
+    )
+
+
+def drive_heartbeat_lost(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    node_id, duration_s = one_of(rng, nodes), float(rng.uniform(0.5, 3.2))
+    must = duration_s > HEARTBEAT_S + 0.5
+    return _of_rig(
+        f"no heartbeat of node {node_id} for {duration_s * 1e3:.0f} ms",
+        {"kind": "heartbeat_silence", "node_id": node_id, "duration_s": duration_s},
+        must_stop=must,
+        detection_s=HEARTBEAT_S + 0.3 if must else NEVER_S,
+    )
+
+
+def _harmless(text: str, act: Callable[[House], None], lasts_s: float = 0.0) -> Real:
+    return Real(Drawn(text, act=act, must_stop=False, may_stop=False, lasts_s=lasts_s))
+
+
+def two_operators(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    return _harmless("a second operator wants to move", second_operator)
+
+
+def hostile_clients(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    seed = int(rng.integers(1 << 30))
+    return _harmless("hostile bytes", lambda house: hostile_bytes(house, seed))
+
+
+def hostile_requests(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    return _harmless("hostile API (schemathesis)", hostile_api)
+
+
+def disk_full(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    duration_s = float(rng.uniform(2.5, 4.0))
+    fault = Drawn(
+        f"disk full for {duration_s * 1e3:.0f} ms",
+        act=lambda house: full_disk(house, duration_s),
+        detection_s=DISK_S,
+        lasts_s=duration_s,
+    )
+    return Real(fault, disk_bytes=64 << 20)
+
+
+def nonsense_profile(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    text = one_of(rng, NONSENSE)
+    return _harmless("profile edited to nonsense", lambda house: spoil_profile(house, text), lasts_s=1.2)
 
 
 def second_operator(house: House) -> None:
@@ -104,9 +242,9 @@ def second_operator(house: House) -> None:
                     house.accepted.append(name)
 
 
-def hostile_bytes(house: House) -> None:
+def hostile_bytes(house: House, seed: int) -> None:
     """Whatever a port scanner, a broken proxy or a fuzzer sends."""
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(seed)
     pieces = (
         b"POST /v1/move HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999999\r\n\r\n",
         b"POST /v1/arm HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n{}",
@@ -167,51 +305,41 @@ def hostile_api(house: House) -> None:
                 once()
 
 
-def full_disk(house: House) -> None:
+def full_disk(house: House, duration_s: float) -> None:
     """Leave no byte on the disk that the runs are on."""
     with contextlib.suppress(OSError), (house.daemon.runs.parent / "filler").open("wb", buffering=0) as file:
         while True:
             file.write(bytes(1 << 16))
-    _later(1.5, lambda: (house.daemon.runs.parent / "filler").unlink(missing_ok=True))
+    _later(duration_s, lambda: (house.daemon.runs.parent / "filler").unlink(missing_ok=True))
 
 
-def nonsense_profile(house: House) -> None:
+def spoil_profile(house: House, text: str) -> None:
+    """Have a profile that is none read again, and the file as it was a second later."""
     kept = house.daemon.profile.read_text()
-    house.daemon.profile.write_text('name = "x"\n[macro]\nmass_kg = nan\n')
+    house.daemon.profile.write_bytes(text.encode("latin-1"))
     house.daemon.process.send_signal(signal.SIGHUP)
     _later(1.0, lambda: house.daemon.profile.write_text(kept))
 
 
-def client_vanishes(house: House) -> None:
-    """A client's program ends while it holds the key."""
-    house.vanish()
-
-
-def _rig(**fault) -> Callable[[House], None]:
-    return lambda house: house.rig_fault(**fault)
-
-
-KINDS: dict[str, Kind] = {
-    "servo killed": Kind(killed_child, RPDO_S, by_drives=True, open_loop=True),
-    "supervisor killed": Kind(killed_supervisor, SUPERVISOR_S),
-    "both killed": Kind(killed_both, RPDO_S, by_drives=True, open_loop=True),
-    "servo stopped": Kind(stopped_child, RPDO_S, lasts_s=3.5, by_drives=True, open_loop=True),
-    "supervisor stopped": Kind(stopped_supervisor, SUPERVISOR_S, lasts_s=1.6),
-    "client vanishes in mid jog": Kind(client_vanishes, LEASE_S, lasts_s=2.5),
-    "beam break": Kind(_rig(kind="beam_loss", axis="macro", duration_s=0.5), 3 * CYCLE_S, lasts_s=0.5),
-    "unplug and replug": Kind(_rig(kind="unplug", duration_s=0.5), 3 * CYCLE_S, lasts_s=0.6),
-    "bus-off and back": Kind(_rig(kind="bus_off", duration_s=0.4), 3 * CYCLE_S, lasts_s=0.4),
-    "interferometer silent": Kind(_rig(kind="sensor_silence", duration_s=0.6), SENSOR_S, lasts_s=0.6, open_loop=True),
-    "EMCY": Kind(_rig(kind="emergency", node_id=1, code=0x7305), 3 * CYCLE_S),
-    "drive reboot": Kind(_rig(kind="power_loss", node_id=1, duration_s=0.5), SENSOR_S, without_power=True, lasts_s=0.6),
-    "frames lost": Kind(_rig(kind="drop_frame", can_id=0x201, duration_s=0.5), RPDO_S, lasts_s=0.5, open_loop=True),
-    "drive's heartbeat lost": Kind(
-        _rig(kind="heartbeat_silence", node_id=1, duration_s=3.0), HEARTBEAT_S + 0.3, lasts_s=3.2
-    ),
-    "two operators": Kind(second_operator, must_stop=False, may_stop=False),
-    "hostile bytes": Kind(hostile_bytes, must_stop=False, may_stop=False),
-    "hostile API (schemathesis)": Kind(hostile_api, must_stop=False, may_stop=False),
-    "disk full": Kind(full_disk, DISK_S, lasts_s=2.0, disk_bytes=64 << 20),
-    "nonsense profile": Kind(nonsense_profile, must_stop=False, may_stop=False, lasts_s=1.2),
+KINDS: dict[str, Draw] = {
+    "servo killed": killed_child,
+    "supervisor killed": killed_supervisor,
+    "both killed": killed_both,
+    "servo stopped": stopped_child,
+    "supervisor stopped": stopped_supervisor,
+    "client vanishes": client_vanishes,
+    "beam break": beam_break,
+    "unplug and replug": unplugged,
+    "bus-off and back": bus_off,
+    "interferometer silent": sensor_silence,
+    "EMCY": emergency,
+    "drive reboot": drive_reboot,
+    "frames lost": frames_lost,
+    "drive's heartbeat lost": drive_heartbeat_lost,
+    "two operators": two_operators,
+    "hostile bytes": hostile_clients,
+    "hostile API (schemathesis)": hostile_requests,
+    "disk full": disk_full,
+    "nonsense profile": nonsense_profile,
 }
 """Every kind, by the name that the tables use."""

@@ -21,7 +21,7 @@ from stagectl.service.remembered import Remembered
 from stagectl.service.service_log import ServiceLog
 from stagectl.service.stage_loop import StageLoop
 from stagectl.service.stage_state import Settings
-from tests.faults.kinds import Drawn
+from tests.faults.kinds import NONSENSE, Drawn, one_of
 from tests.faults.witness import WitnessedRig
 from tests.small_disk import small_disk
 from tests.struck_stage import home_by_truth
@@ -34,7 +34,6 @@ _TOP_M_PER_S = 0.449  # moves are planned to 0.9 of the profile's 0.5
 _PATIENCE_S = 15.0  # of the rig's time: to a standstill, and from a fault to the next state
 _TRIES = 4
 _DISK_BYTES = 24 << 20
-_NONSENSE = ("", "name = 3\n", 'name = "x"\n[macro]\nmass_kg = nan\n', "\x00\xff not a profile", "[macro\n")
 
 
 class _Backend(BatchBackend):
@@ -61,6 +60,7 @@ class Facts:
     trouble: str = ""  # why the stage could not be armed again; empty where it could
     fault_kind: str = ""
     fault_text: str = ""
+    late_s: float = 0.0  # by which a host held up who had to notice it
     accepted: list[str] = field(default_factory=list)  # of what nobody may ask
     seen: dict[str, np.ndarray] = field(default_factory=dict)
     sync_t_ns: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -309,7 +309,7 @@ class Scene:
 
     def edit_profile(self, rng: np.random.Generator) -> None:
         """Spoil the file, and ask for it to be read again."""
-        self.profile_path.write_bytes(_NONSENSE[int(rng.integers(len(_NONSENSE)))].encode("latin-1"))
+        self.profile_path.write_bytes(one_of(rng, NONSENSE).encode("latin-1"))
         self.loop.reread()
 
     # ---- the run -------------------------------------------------------------------------------------------------
@@ -334,7 +334,7 @@ class Scene:
             self.facts.fault_kind, self.facts.fault_text = fault.kind, fault.values
         self.facts.trouble = self._way_back()
         self.facts.seen = self.rig.seen()
-        self.facts.sync_t_ns = np.array(self.rig.sync_t_ns, np.int64)
+        self.facts.sync_t_ns = self.facts.seen["sync_t_ns"]
         return self.facts
 
     def _quiet(self) -> bool:

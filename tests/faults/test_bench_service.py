@@ -2,6 +2,7 @@
 
 import ast
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,12 @@ from bench import service, service_batch, service_processes
 from bench.journal import Journal
 from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
-from tests.faults import real
-from tests.faults.judge import BACK, LOST, TRAVEL
+from tests.faults import losses, real
+from tests.faults.judge import BACK, LOST, TRAVEL, _bound_m
+from tests.faults.mechanics import mechanics_of
+from tests.faults.witness import ENABLED
 
+MOTIONS = ("jogging", "moving", "homing", "identifying")
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = '''
 LIMIT = 3
@@ -66,22 +70,77 @@ def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path, monkey
     assert Journal(None).entries == {}
 
 
+def test_a_seed_with_real_processes_is_the_same_run_again_and_all_of_them_are_drawn():
+    drawn = [real.drawn(seed) for seed in range(service_processes.FULL_RUNS)]
+    assert [one.text for one in drawn] == [real.drawn(seed).text for seed in range(service_processes.FULL_RUNS)]
+    assert {one.kind for one in drawn} == set(real.KINDS)
+    assert {one.phase for one in drawn} == {*MOTIONS, "at rest", "arming", "stopping", "idle"}
+    assert sum(one.profile == "oled-printer" for one in drawn) > 25
+    assert all(one.profile == "oled-printer" for one in drawn if one.phase == "identifying")
+    assert {2 in one.fault.drawn.without_power for one in drawn if one.kind == "drive reboot"} == {False, True}
+    assert len({one.wait_s for one in drawn}) == len(drawn)
+
+
 def test_the_bound_of_a_run_with_real_processes():
-    """t = 0.1 + 0.001 + 0.01 s at 0.12 m/s, ramp 5 m/s^2: 13.32 + 1.44 mm."""
-    moving = {"macro_velocity_m_per_s": -0.12, "macro_position_m": 0.05}
-    assert real._bound_m(real.KINDS["servo killed"], moving, 0.01) == pytest.approx(14.76e-3, abs=0.01e-3)
-    driven = moving | {"macro_position_m": 0.062}  # magnets of 2 N on 12 kg, and the drive keeps what balanced them
-    assert real._bound_m(real.KINDS["servo killed"], driven, 0.01) == pytest.approx(16.05e-3, abs=0.01e-3)
-    assert real._bound_m(real.KINDS["EMCY"], driven, 0.107) == pytest.approx(14.76e-3, abs=0.01e-3)
-    coasts = real._bound_m(real.KINDS["drive reboot"], moving, 0.01)
-    assert coasts == pytest.approx(0.05 + 0.17 + 0.008)
+    """t = 0.1 + 0.001 + 0.01 s from 0.12 m/s, 5 m/s^2 of ramp: 13.32 + 1.44 mm; magnets, 2 N on 12 kg, 0.33 m/s^2."""
+    t_ns = np.arange(1000) * 1_000_000
+    steady, driven = np.full(1000, -0.12), -0.12 - 0.0005 * (np.arange(1000) - 500).clip(min=0)
+    single = mechanics_of("single-axis")
+    bound_m = partial(_bound_m, t_ns, at=500, detection_s=0.11, of=single)
+    assert bound_m(steady) == pytest.approx(14.76e-3, abs=0.01e-3)
+    assert bound_m(steady, open_loop=True) == pytest.approx(14.76e-3, abs=0.01e-3)
+    t, a = 0.111, 4.0 / 12.12
+    rolled_m = 0.12 * t + 0.5 * a * t * t + (0.12 + a * t) ** 2 / 10.0
+    assert bound_m(driven, open_loop=True) == pytest.approx(rolled_m, abs=0.01e-3)
+    assert bound_m(driven) > rolled_m + 1e-3  # of a plan that goes on
 
 
-def test_the_seeded_part_has_every_process_killed_and_stopped():
-    kinds = {list(real.KINDS)[seed % len(real.KINDS)] for seed in service_processes.SEEDS}
-    assert len(kinds) == len(service_processes.SEEDS) >= 10
+def test_the_seeded_part_has_every_process_killed_and_stopped_in_every_motion():
+    drawn = [real.drawn(seed) for seed in service_processes.SEEDS]
+    kinds = {one.kind for one in drawn}
+    assert len(kinds) == len(drawn) >= 10
     struck = {f"{name} {how}" for name in ("servo", "supervisor") for how in ("killed", "stopped")}
-    assert struck | {"disk full", "two operators", "hostile API (schemathesis)", "client vanishes in mid jog"} <= kinds
+    assert struck | {"disk full", "two operators", "hostile API (schemathesis)", "client vanishes"} <= kinds
+    assert {one.phase for one in drawn} >= set(MOTIONS)
+    assert len({one.profile for one in drawn}) == 2
+
+
+def test_rows_are_held_against_the_syncs_of_the_newest_run(tmp_path, monkeypatch):
+    """Two runs; the second has 40 rows, of which 3 in the middle are missing, and 2 SYNCs come behind its last."""
+    t_ns = np.arange(100) * 1_000_000
+    files = {"1": t_ns[:20], "2": np.delete(t_ns[50:90], [10, 11, 12])}
+    for name in files:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "samples.arrow").write_bytes(b"")
+    monkeypatch.setattr(losses, "read_run", lambda folder: None)
+    monkeypatch.setattr(losses, "_t_ns_of", lambda path: files[path.parent.name])
+    seen = {"sync_t_ns": t_ns[:92] + 500_000}
+    found = losses.loss_of(tmp_path, seen, 0, int(t_ns[-1]))
+    assert (found.syncs_count, found.rows_count, found.cycles_lost) == (42, 37, 4)
+    assert losses.loss_of(tmp_path, seen, int(t_ns[95]), int(t_ns[-1])).rows_count == 0
+
+
+def test_when_the_drives_stopped_is_read_from_the_rig_s_log():
+    """Killed at 500 ms, 21 ms until the drive follows no more, 24 ms of ramp from 0.12 m/s."""
+    ms = np.arange(1000)
+    seen = {
+        "t_ns": ms * 1_000_000,
+        "states": np.stack([np.where(ms < 521, ENABLED, 5), np.full(1000, -1)], axis=1),
+        "macro_velocity_m_per_s": (0.12 - 5e-3 * (ms - 521).clip(min=0)).clip(min=0.0),
+    }
+    found = losses.stopped(seen, 500_000_000)
+    assert found.begun_s == pytest.approx(0.021)
+    assert found.rest_s == pytest.approx(0.024)
+    seen["states"][:, 0] = ENABLED
+    assert losses.stopped(seen, 500_000_000).begun_s == np.inf
+
+
+def test_the_last_figure_is_how_long_all_parts_took(monkeypatch):
+    monkeypatch.setattr(service, "PARTS", {"soak": lambda **_: iter(()), "batch": lambda **_: iter(())})
+    (figure,) = service.figures(full=False, say=lambda text: None)
+    assert (figure.figure, figure.bar, figure.holds) == ("all parts together", "<= 900 s", True)
+    assert figure.reason == "soak 0 s, batch 0 s"
+    assert list(service.figures(full=False, say=lambda text: None, part="soak")) == []
 
 
 def test_parts_are_named():

@@ -6,8 +6,22 @@ import numpy as np
 import pytest
 
 from tests.faults import campaign
-from tests.faults.judge import BACK, BEGUN, COURSE, LOST, STANDSTILL, STRANGER, TRAVEL, Record, judge
-from tests.faults.kinds import KINDS, SILENCE_S, Drawn
+from tests.faults.judge import (
+    BACK,
+    BEGUN,
+    COURSE,
+    LIMP,
+    LOST,
+    STANDSTILL,
+    STRANGER,
+    STRUCK,
+    TRAVEL,
+    Record,
+    judge,
+)
+from tests.faults.kinds import KINDS, MACRO, MICRO, SILENCE_S, Drawn
+from tests.faults.limp import shorted_way_m
+from tests.faults.mechanics import mechanics_of
 from tests.faults.scene import Facts
 from tests.faults.witness import ENABLED
 
@@ -35,10 +49,14 @@ def rest_after(ramp_m_per_s2: float, noticed_s: float = 0.02) -> tuple[Facts, Re
     velocity = speed.clip(min=0.0)
     states = np.full((2000, 2), ENABLED)
     states[t_s > 1.0 + noticed_s] = _STOPPED
+    position = np.cumsum(velocity) * 1e-3
     seen = {
         "t_ns": (t_s * 1e9).astype(np.int64),
         "macro_velocity_m_per_s": velocity,
-        "macro_position_m": np.cumsum(velocity) * 1e-3,
+        "macro_position_m": position,
+        "end_velocity_m_per_s": velocity.copy(),
+        "end_position_m": position + 70e-6,
+        "micro_force_n": np.zeros(2000),
         "states": states,
     }
     facts = Facts(
@@ -111,6 +129,34 @@ def test_judges_see_a_drive_that_creeps_on_before_it_stands():
     facts, record = rest_after(2.0)
     facts.seen["macro_position_m"][1350:] += 3e-3
     assert bars_missed(facts, record) == {TRAVEL, STANDSTILL}
+
+
+def test_judges_see_a_macro_that_coasts_faster_than_the_guard_lets_it_be():
+    """0.5 m/s where the way is long; 1 cm before the end of travel no more than what 2 m/s^2 can stop: 0.2 m/s."""
+    dark = replace(FAULT, without_power=(MACRO,))
+    facts, record = rest_after(0.0, noticed_s=0.9)
+    facts.seen["macro_position_m"] += 0.0135 - facts.seen["macro_position_m"][1000]
+    facts.seen["states"][1000:] = 1
+    assert STRUCK not in bars_missed(facts, record, dark)
+    facts.seen["macro_velocity_m_per_s"][1300] = 0.53  # and what magnets and cables give it: 0.51
+    assert STRUCK in bars_missed(facts, record, dark)
+    facts.seen["macro_velocity_m_per_s"][1300] = 0.4
+    facts.seen["macro_position_m"] += 0.44 - facts.seen["macro_position_m"][1000]
+    assert STRUCK in bars_missed(facts, record, dark)
+
+
+def test_judges_see_a_micro_whose_winding_was_left_open():
+    """Beside a macro that its ramp stops from 0.4 m/s: shorted, the way that the rig's own motion has."""
+    dark = replace(FAULT, without_power=(MICRO,))
+    machine = mechanics_of("oled-printer").machine
+    facts, record = rest_after(2.0)
+    shorted_m, open_m = (shorted_way_m(machine, facts.seen, 1000, 1600, shorted=how) for how in (True, False))
+    assert 1.1 * shorted_m < open_m
+    macro_m, end_m = (facts.seen[f"{axis}_position_m"] for axis in ("macro", "end"))
+    end_m[1200] = macro_m[1200] - shorted_m
+    assert bars_missed(facts, record, dark) == set()
+    end_m[1200] = macro_m[1200] - open_m
+    assert bars_missed(facts, record, dark) == {LIMP}
 
 
 PUSHED = replace(FAULT, pushed=True, lasts_s=0.3)

@@ -1,0 +1,68 @@
+"""What laws of motion have to know of a stage: its profile as a file, the rig's machine; no code of the controller."""
+
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from sim_backend.machine import Machine, load_machine
+from stagectl.profile import PROFILES_FOLDER
+
+_PLAN_SHARE, _PLAN_RAMP_SHARE, _JERK_TIME_S = 0.9, 0.5, 0.1  # what moves are planned with
+_TOUCH_N = 5.0  # no joint is pressed harder
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """A stage as its judges need it; SI."""
+
+    machine: Machine
+    ramp_m_per_s2: float  # the drive's, 0x6085
+    plan_m_per_s2: float  # what its moves are planned with
+    plan_m_per_s3: float
+    speed_limit_m_per_s: float  # the guard's
+    travel_m: tuple[float, float]  # in which the guard wants to be able to stop it
+
+    def _of(self, name: str) -> list[dict]:
+        return [row for row in self.machine.effects if row["name"] == name]
+
+    @property
+    def drift_m_per_s2(self) -> float:
+        """By how much a macro's acceleration changes on its way while its drive's force stays."""
+        change_n = 2.0 * sum(row["amplitude_n"] for row in self._of("cogging"))
+        micro = self.machine.micro
+        if micro is not None:
+            change_n += _TOUCH_N + 2.0 * micro.spring_n_per_m * max(micro.stroke_m)
+        return change_n / self.machine.macro.mass_kg
+
+    def coasting_m_per_s(self, position_m: float, velocity_m_per_s: float) -> float:
+        """Return how fast a macro may get that loses its power there: the guard's limit, and what it rolls down."""
+        low_m, high_m = self.travel_m
+        left_m = high_m - position_m if velocity_m_per_s > 0.0 else position_m - low_m
+        guarded = min(self.speed_limit_m_per_s, np.sqrt(2.0 * self.ramp_m_per_s2 * max(left_m, 0.0)))
+        first_m, last_m = self.machine.macro.travel_m
+        work_j = sum(row["amplitude_n"] * row["pitch_m"] / np.pi for row in self._of("cogging"))
+        work_j += sum(abs(row["force_n"]) * (last_m - first_m) for row in self._of("offset"))
+        for row in self._of("cable_spring"):
+            furthest_m = max(abs(first_m - row["anchor_m"]), abs(last_m - row["anchor_m"]))
+            work_j += 0.5 * row["stiffness_n_per_m"] * furthest_m**2
+        return float(np.sqrt(guarded**2 + 2.0 * work_j / self.machine.macro.mass_kg))
+
+
+@cache
+def mechanics_of(name: str) -> Mechanics:
+    """Return the mechanics of a shipped profile and the machine of its name."""
+    profile = tomllib.loads((PROFILES_FOLDER / f"{name}.toml").read_text())
+    macro, stray_m = profile["macro"], profile["control"]["error_limit_m"]
+    ramp = macro["stop_deceleration_m_per_s2"]
+    plan = _PLAN_SHARE * min(macro["acceleration_limit_m_per_s2"], _PLAN_RAMP_SHARE * ramp)
+    low_m, high_m = macro["travel_m"]
+    return Mechanics(
+        load_machine(name),
+        ramp,
+        plan,
+        plan / _JERK_TIME_S,
+        macro["velocity_limit_m_per_s"],
+        (low_m - stray_m, high_m + stray_m),
+    )
