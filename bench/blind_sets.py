@@ -7,17 +7,19 @@ of the generator's sources (`--sets`), so that a second call takes the searching
 """
 
 import argparse
-import concurrent.futures
 import hashlib
 import json
 import multiprocessing
 import os
+import queue
 import sys
 import tempfile
 import time
 import tomllib
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -284,20 +286,34 @@ def searched(jobs: Sequence[Job], workers: int, until_s: float = float("inf")) -
         return
     for name in _THREADS:  # heard by the workers: they must not fight for the processors
         os.environ.setdefault(name, str(max(1, (os.cpu_count() or 1) // workers)))
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting = {pool.submit(search, job): job for job in jobs}
-        for future in concurrent.futures.as_completed(waiting):
-            if time.monotonic() >= until_s:
-                for other in waiting:
-                    other.cancel()
-            if future.cancelled():
-                continue
-            job = waiting[future]
-            try:
-                yield future.result()
-            except concurrent.futures.process.BrokenProcessPool as error:
-                yield Searched(job.seed, None, NOTHING, 0, (0.0, 0.0), 0.0, 0.0, f"the worker died: {error}")
+    lanes: queue.SimpleQueue[ProcessPoolExecutor] = queue.SimpleQueue()
+    for _ in range(workers):
+        lanes.put(_lane())
+    try:
+        with ThreadPoolExecutor(workers) as waiting:
+            for future in as_completed([waiting.submit(_searched_in, lanes, job, until_s) for job in jobs]):
+                if (one := future.result()) is not None:
+                    yield one
+    finally:
+        while not lanes.empty():
+            lanes.get().shutdown()
+
+
+def _lane() -> ProcessPoolExecutor:
+    """Return a pool of one process: where it dies, the other sets don't die with it."""
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+
+
+def _searched_in(lanes: queue.SimpleQueue[ProcessPoolExecutor], job: Job, until_s: float) -> Searched | None:
+    """Search a set in whichever process is free; None where the time is up."""
+    lane = lanes.get()
+    try:
+        return lane.submit(search, job).result() if time.monotonic() < until_s else None
+    except BrokenProcessPool as error:
+        lane = _lane()
+        return Searched(job.seed, None, NOTHING, 0, (0.0, 0.0), 0.0, 0.0, f"the worker died: {error}")
+    finally:
+        lanes.put(lane)
 
 
 # ---- marking ---------------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Blind sets as the gap workflow gets them: read rightly, held out by the rule, marked, and robust to a failure."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -233,6 +234,22 @@ def test_an_error_is_wrong_and_the_others_go_on(tmp_path):
     assert [one.label for one in done] == ["error", "error"]
     assert not any(one.right for one in done)
     assert "2 sets ended in an error: 1, 2" in "\n".join(summary_lines(done))
+
+
+class KillsItsReader:
+    def __reduce__(self):
+        return os._exit, (1,)
+
+
+def test_a_worker_that_dies_takes_its_own_set_with_it_only(tmp_path):
+    """The others end in an error of their own here, which is quick; the death of a worker is not theirs."""
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    deadly = Job(1, "null", blocked, options=(("without", KillsItsReader()),))
+    jobs = [deadly, *(Job(seed, "null", blocked) for seed in (2, 3, 4))]
+    done = {one.seed: one.error for one in blind_sets.searched(jobs, 2)}
+    assert {seed for seed, error in done.items() if "the worker died" in error} == {1}
+    assert all("NotADirectoryError" in done[seed] for seed in (2, 3, 4))
 
 
 def test_summary_counts_an_error_against_its_bar():
