@@ -29,6 +29,7 @@ from pyarrow import csv
 
 from bench.blind_names import in_words_of_the_truth
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
+from stagectl.gap.heap import keep_freed
 from stagectl.gap.log import Log
 from stagectl.gap.workflow import find
 from tests.blind import generate, score
@@ -246,6 +247,7 @@ def search(job: Job) -> Searched:
     """Generate, read and search one set; an error of the workflow is a result, and counts as wrong."""
     truth = None
     begin_s = time.monotonic()
+    keep_freed()
     try:
         folder, truth = generated(job)
         blind = load_set(folder)

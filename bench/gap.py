@@ -27,6 +27,7 @@ from bench.blind_sets import (
 from bench.figure import Bar, Figure, absent, judged
 from stagectl.gap.believed import Believed
 from stagectl.gap.crew import crew_of
+from stagectl.gap.heap import keep_freed
 from stagectl.gap.log import Log
 from stagectl.gap.workflow import find
 
@@ -67,6 +68,7 @@ def figures(*, full: bool, say: Say) -> Iterator[Figure]:
 
 def speed(full: bool, say: Say) -> Iterator[Figure]:
     """Time the whole search, warm, on four recordings of both axes: with nothing missing, and with several effects."""
+    keep_freed()
     cases = {}
     for kind in ("null", "multi"):
         folder, truth = generated(Job(SPEED_SEED, kind, sets_folder()))

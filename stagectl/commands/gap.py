@@ -20,6 +20,7 @@ from stagectl.gap.believed import Believed, document_of, load_believed
 from stagectl.gap.crew import Dask, crew_of
 from stagectl.gap.findings import Findings, Named
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
+from stagectl.gap.heap import keep_freed
 from stagectl.gap.log import Log, read_log
 from stagectl.gap.profile_sheet import Change
 from stagectl.gap.workflow import find
@@ -42,6 +43,7 @@ def search(
     """Compete all effects on the recordings, judge on those held out, and write what was found."""
     if workers_count is not None and dask is not None:
         raise RequestError("--workers is of this machine and --dask of a cluster; give one of them")
+    keep_freed()
     believed = load_believed(profile)
     logs = [_log(run, runs_root, believed) for run in training]
     apart = [_log(run, runs_root, believed) for run in held]
