@@ -217,10 +217,8 @@ def status_table(found: messages.Status) -> Table:
         )
     lease = found.lease
     table.add_row("[dim]lease[/]", "free" if lease is None else escape(f"{lease.holder}, {lease.left_s:.1f} s"))
-    joint = found.backlash
-    if joint is not None:
-        sd = "" if joint.width_sd_m is None else f" +- {joint.width_sd_m * 1e6:.2f} um"
-        table.add_row("[dim]backlash[/]", escape(f"{joint.width_m * 1e6:.2f} um{sd}, identified {joint.at}"))
+    for title, text in _joint_rows(found):
+        table.add_row(title, text)
     health = found.health
     late = "" if health.lateness_p99_s is None else f", 99 % within {health.lateness_p99_s * 1e6:.0f} us"
     table.add_row("[dim]cycles[/]", f"{health.cycles_count}, {health.missed_cycles_count} missed{late}")
@@ -232,6 +230,25 @@ def status_table(found: messages.Status) -> Table:
     for remark in found.remarks:
         table.add_row("[dim]remark[/]", f"[yellow]{escape(remark)}[/]")
     return table
+
+
+def _joint_rows(found: messages.Status) -> Iterator[tuple[str, str]]:
+    """Say what is known of the joint now, and what of its wear passes a limit."""
+    joint = found.wear or found.backlash
+    if joint is None:
+        return
+    sd = "" if joint.width_sd_m is None else f" +- {joint.width_sd_m * 1e6:.2f} um"
+    width = f"{joint.width_m * 1e6:.2f} um{sd}"
+    if found.wear is None:
+        yield "[dim]backlash[/]", escape(f"{width}, identified {joint.at}")
+        return
+    yield "[dim]backlash[/]", escape(f"{width}, {found.wear.source} at {joint.at}")
+    if not found.wear.observable:
+        yield "", f"[yellow]{escape(found.wear.text)}[/]"
+    if found.wear.believed_since:
+        yield "", escape(f"the compensation believes what it learned at {found.wear.believed_since}")
+    if found.wear.alarm:
+        yield "[red]wear[/]", f"[red]{escape(found.wear.alarm)}[/]"
 
 
 def _temperature(axis: str, one: messages.Temperature) -> str:

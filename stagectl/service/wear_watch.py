@@ -139,7 +139,7 @@ class WearWatch:
         now_s, newest = self._now_s(), tracker.newest
         one, age_s, observable = newest.estimate, max(now_s - newest.t_s, 0.0), tracker.observable(now_s)
         age = (
-            "" if observable else f"not observable: both edges were not touched lately; the value is {age_s:.0f} s old"
+            "" if observable else f"not observable: both edges were not touched lately; the value is {_span(age_s)} old"
         )
         return messages.Wear(
             left_m=one.left_m,
@@ -163,3 +163,11 @@ class WearWatch:
         """Return the newest value where production motion showed it; None where it is somebody else's."""
         newest = None if self._tracker is None else self._tracker.newest
         return None if newest is None or newest.source != PRODUCTION else newest.estimate
+
+
+def _span(time_s: float) -> str:
+    """Say a time in the largest unit of which it has two or more."""
+    for unit, unit_s in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if time_s >= 2.0 * unit_s:
+            return f"{time_s / unit_s:.1f} {unit}"
+    return f"{time_s:.0f} s"

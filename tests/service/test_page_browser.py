@@ -12,9 +12,11 @@ import time
 
 import pytest
 
+from stagectl.profile import PROFILES_FOLDER
 from stagectl.service.access import Role
 from tests.service.daemon import REST_M_PER_S
-from tests.service.pages import PageServer
+from tests.service.pages import PageServer, ServiceInVirtualTime
+from tests.toml_text import changed
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 try:
@@ -40,6 +42,19 @@ def page_server(daemon):
 
 
 @pytest.fixture(scope="module")
+def worn_page_server(tmp_path_factory):
+    """A stage with a joint whose profile allows next to no wear, in virtual time: a browser starves no servo there."""
+    folder = tmp_path_factory.mktemp("worn")
+    profile = folder / "worn.toml"
+    profile.write_text(changed(PROFILES_FOLDER / "oled-printer.toml", {"wear": {"width_change_limit_m": 1e-6}}))
+    service = ServiceInVirtualTime(folder, profile)
+    server = PageServer(service.socket, service.runs)
+    yield server
+    server.end()
+    service.end()
+
+
+@pytest.fixture(scope="module")
 def chromium(tmp_path_factory):
     """A browser that leaves the servo its processor: two are all that many a test host has."""
     wrapper = tmp_path_factory.mktemp("browser") / "chromium"
@@ -53,18 +68,18 @@ def chromium(tmp_path_factory):
 
 
 @pytest.fixture
-def opened(chromium, page_server):
-    """Open the page for a role: a function; what a page complains of fails the test."""
+def opened_at(chromium):
+    """Open the page of a server for a role: a function; what a page complains of fails the test."""
     complaints, contexts = [], []
 
-    def open_page(role, **how):
+    def open_page(server, role, **how):
         context = chromium.new_context(**how)
         contexts.append(context)
         page = context.new_page()
         page.set_default_timeout(PATIENCE_MS)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("console", lambda said: complaints.append(said.text) if "Content Security" in said.text else None)
-        page.goto(page_server.link(role))
+        page.goto(server.link(role))
         page.wait_for_url("**/")
         expect(page.locator("#state")).not_to_have_attribute("data-state", "lost", timeout=PATIENCE_MS)
         return page
@@ -73,6 +88,12 @@ def opened(chromium, page_server):
     for context in contexts:
         context.close()
     assert complaints == []
+
+
+@pytest.fixture
+def opened(opened_at, page_server):
+    """Open the page of the daemon that all tests share: a function."""
+    return functools.partial(opened_at, page_server)
 
 
 def state_is(page, *states):
@@ -131,6 +152,41 @@ def test_an_operator_homes_moves_jogs_while_held_and_stops(idle, opened):
     state_is(page, "idle")
     page.click("#take")  # given back
     expect(page.locator("#lease")).to_have_text("nobody operates")
+
+
+def test_a_run_begun_and_ended_by_its_buttons_is_in_the_list(idle, opened):
+    page = opened(Role.OPERATE)
+    expect(page.locator("#banner")).to_have_text("SOFTWARE RIG: nothing real moves")
+    page.click("#take")
+    page.click("#record")
+    expect(page.locator("#recording")).to_have_text(re.compile(r"^[\d,]+ rows$"), timeout=PATIENCE_MS)
+    name = page.locator("#recording-run").text_content()
+    assert (idle.runs / name).is_dir()
+    page.click("#record-end")
+    expect(page.locator("#recording")).to_have_text("last seconds", timeout=PATIENCE_MS)
+    row = page.locator("#runs tbody tr", has_text=name)
+    expect(row.locator("td").nth(1)).to_have_text("closed", timeout=PATIENCE_MS)
+    page.click("#take")
+
+
+def test_a_joint_identified_from_the_page_stands_there_and_says_that_it_is_worn(worn_page_server, opened_at):
+    """The rig's gap is 2.2 um narrower than the profile has it, and the profile's limit 1 um."""
+    page = opened_at(worn_page_server, Role.OPERATE)
+    expect(page.locator("#wear")).to_be_hidden()
+    page.click("#take")
+    page.click("#home")
+    state_is(page, "armed")
+    page.fill("#identify-duration", "6")
+    page.click("#identify")
+    expect(page.locator("#command-text")).to_contain_text("identify: done: backlash 199.", timeout=PATIENCE_MS)
+    expect(page.locator("#backlash")).to_have_text(re.compile(r"^199\.\d\d ± 0\.\d\d µm$"), timeout=PATIENCE_MS)
+    expect(page.locator("#backlash-at")).to_have_text(re.compile("^(identified|production) 20"))
+    expect(page.locator("#wear")).to_contain_text("the limit is 1 um")
+    expect(page.locator("#backlash-tile")).to_have_class(re.compile("bad"))
+    if picture := os.environ.get("STAGECTL_PICTURE"):
+        page.screenshot(path=picture, full_page=True)
+    page.click("#stop")
+    state_is(page, "idle")
 
 
 def test_a_page_that_vanishes_in_the_middle_of_a_jog_stops_the_stage(idle, opened, chromium):

@@ -10,6 +10,7 @@ const AGAIN_MS = 1000;
 const LOG_AGAIN_MS = 2000;
 const LOG_LINES = 30;
 const RUNS_MOST = 50;
+const RUN_CLOSES_MS = 1500; // after a run ended its file is closed
 
 const byId = (id) => document.getElementById(id);
 const write = (id, text) => { const place = byId(id); if (place.textContent !== text) place.textContent = text; };
@@ -29,7 +30,7 @@ const operator = new Operator();
 let scope = null;
 let heardAt = performance.now();
 let missedAtFirst = null;
-let lastState = '';
+let lastRun = '';
 
 // ---- status and samples -------------------------------------------------------------------------------------------
 
@@ -107,12 +108,21 @@ function showHealth(status) {
   write('late-max', health.lateness_max_s === null ? '' : `greatest ${number(health.lateness_max_s, 1e6, 0)} µs`);
   write('lost-samples', health.lost_samples_count.toLocaleString('en'));
   write('discarded', `${health.discarded_bytes_count.toLocaleString('en')} bytes discarded`);
-  const sd = backlash?.width_sd_m ? ` ± ${number(2 * backlash.width_sd_m, 1e6, 2)}` : '';
-  write('backlash', backlash ? `${number(backlash.width_m, 1e6, 2)}${sd} µm` : '–');
-  write('backlash-at', backlash ? `identified ${backlash.at.slice(0, 16).replace('T', ' ')} UTC` : 'not identified');
+  showJoint(status.wear ?? backlash, status.wear);
   write('recording', recording?.run ? `${recording.rows_count.toLocaleString('en')} rows` : 'last seconds');
   write('recording-run', recording?.trouble || recording?.run || 'in memory');
   byId('recording-tile').classList.toggle('bad', Boolean(recording?.trouble));
+}
+
+// `joint`: what is known of it now, or was identified once; `wear`: null where nobody follows it.
+function showJoint(joint, wear) {
+  const sd = joint?.width_sd_m ? ` ± ${number(2 * joint.width_sd_m, 1e6, 2)}` : '';
+  write('backlash', joint ? `${number(joint.width_m, 1e6, 2)}${sd} µm` : '–');
+  write('backlash-at', joint ? `${wear?.source ?? 'identified'} ${joint.at.slice(0, 16).replace('T', ' ')} UTC` : 'not identified');
+  write('backlash-age', wear?.text ?? '');
+  byId('backlash-tile').classList.toggle('bad', Boolean(wear?.alarm));
+  byId('wear').hidden = !wear?.alarm;
+  write('wear', wear?.alarm ?? '');
 }
 
 function showTemperatures(temperatures) {
@@ -156,10 +166,9 @@ function showStatus(status) {
   const remarks = [...stale, ...status.remarks];
   write('remarks', remarks.join('\n'));
   byId('remarks').hidden = remarks.length === 0;
-  if (status.state !== lastState) {
-    if (['moving', 'identifying', 'armed'].includes(lastState)) setTimeout(showRuns, 1500);
-    lastState = status.state;
-  }
+  const run = status.recording?.run ?? '';
+  if (run !== lastRun) setTimeout(showRuns, RUN_CLOSES_MS);
+  lastRun = run;
 }
 
 function take(message) {
