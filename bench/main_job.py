@@ -47,6 +47,7 @@ INSTANT_USB = Bar("recovered sample instant, 125 us USB frames, error rms", "us"
 SEAMS = Bar("wire against value seam, same noise: end position, rms", "nm", 0.5)
 REPLAY = Bar("replay, every law, every machine: rows that differ", "rows", 0.0)
 TICK = Bar("estimate + law + guard, one tick called from Python, p50", "us", 15.0)
+LINE = Bar("a text line of two beams (uMD2), decoded, p50", "us", 15.0)
 SERVO = Bar("line readable to TPDOs decoded, tick, RPDOs and SYNC written, p50", "us", 100.0)
 VALUE_SEAM = Bar("value seam, effects on, substep <= 50 us", "x real time", 500.0, at_least=True)
 WIRE = Bar("wire seam in batch, one process", "x real time", 5.0, at_least=True)
@@ -72,6 +73,7 @@ def _speeds() -> Iterator[Figure]:
     profile, machine = load_profile(STAGE), load_machine(STAGE)
     slowest_s = max(speeds.tick_s(profile, machine, law) for law in LAW_NAMES)
     yield judged(TICK, slowest_s * 1e6, reason="the slower law")
+    yield judged(LINE, speeds.line_s() * 1e6, reason="aim 5 us")
     least = min(speeds.value_seam_ratio(profile, machine, law) for law in LAW_NAMES)
     yield judged(VALUE_SEAM, least, [1], "of processor time, one core; the slower law")
 

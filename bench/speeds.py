@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.framers import framer_for
 from sim_backend.machine import Machine
 from stagectl import batch, tick, trajectory
 from stagectl.backend import BatchBackend
@@ -21,6 +22,7 @@ RUNS_COUNT = 5
 """Absolute times are the median of so many runs."""
 
 _MOVE = (0.8, 0.2, -0.4)  # stroke, speed, start
+_LINES_COUNT = 2000
 _RIG_TRIES_COUNT = 6
 _RIG_ROWS_COUNT = 5000
 _DUE_NS = 20_000  # a line that comes so shortly before the cycle is due is decoded behind it
@@ -61,6 +63,22 @@ def tick_s(profile: Profile, machine: Machine, law: str) -> float:
             controller.step()
             spent_ns[k] = clock_ns() - begin_ns
         medians.append(float(np.median(spent_ns)) * 1e-9)
+    return statistics.median(medians)
+
+
+def line_s() -> float:
+    """Return the p50 of decoding a line of a uMD2 that reads two beams: median of the runs, s."""
+    line = b"3000 3001 1234567 5 16384 %d 0 0 2999 -1234567 1 32768 0 0 0 0\r\n"
+    medians = []
+    for _ in range(RUNS_COUNT):
+        framer = framer_for({"format": "umd2", "incremental": True, "frame": {}})
+        spent_ns = []
+        for number in range(_LINES_COUNT):
+            data = line % (100_000 + number)
+            begin_ns = time.perf_counter_ns()
+            framer.feed(data)
+            spent_ns.append(time.perf_counter_ns() - begin_ns)
+        medians.append(statistics.median(spent_ns) * 1e-9)
     return statistics.median(medians)
 
 

@@ -104,8 +104,9 @@ class LinearSystem:
         b, d = self.b[:, self.inputs.index(source)], self.d[self.outputs.index(outcome), self.inputs.index(source)]
         c = self.c[self.outputs.index(outcome)]
         z = np.exp(2j * np.pi * np.asarray(frequency_hz, float) * self.period_s)
-        eye = np.eye(self.a.shape[0])
-        solved = np.linalg.solve(z[..., None, None] * eye - self.a, np.broadcast_to(b[:, None], (*z.shape, b.size, 1)))
+        pencil = np.tile(-self.a.astype(complex), (*z.shape, 1, 1))
+        np.einsum("...ii->...i", pencil)[...] += z[..., None]
+        solved = np.linalg.solve(pencil, np.broadcast_to(b[:, None], (*z.shape, b.size, 1)))
         return solved[..., 0] @ c + d
 
 
@@ -270,16 +271,16 @@ class _Slots:
     """Numbers in structured arrays, as one vector: read it, write it, and how far each is moved for a difference."""
 
     def __init__(self, places: Sequence[tuple[np.ndarray, str]], memory: np.ndarray) -> None:
-        self._places = places
+        self._places = [array[name] for array, name in places]
         self._memory = memory
         self.names = (*(name for _, name in places), *(f"memory {k}" for k in range(memory.size)))
 
     def read(self) -> np.ndarray:
-        return np.array([*(float(array[name][0]) for array, name in self._places), *self._memory])
+        return np.concatenate([[place.item() for place in self._places], self._memory])
 
     def write(self, values: np.ndarray) -> None:
-        for (array, name), value in zip(self._places, values, strict=False):
-            array[name] = value
+        for place, value in zip(self._places, values, strict=False):
+            place[0] = value
         self._memory[:] = values[len(self._places) :]
 
 
@@ -337,14 +338,14 @@ def _tick_map(
     contact_n = float(one.model["contact_force_n"][0])
     one.restore(before_contact)
     one.estimator["sampled_contact_n"] = contact_n  # a contact that stands still is no change of one
-    rest = one.snapshot()
+    back_to_rest = one.returner(one.snapshot())
     measured = [f"{name}_position_m" for name in _seen(axes)]
     n = len(slots.names)
     words = {f"{axis}_word": float(one.estimator[f"{axis}_amperes_per_word"][0]) for axis in axes}
     words |= {f"{name}_before": value for name, value in words.items()}
 
     def run(values: np.ndarray) -> np.ndarray:
-        one.restore(rest)
+        back_to_rest()
         slots.write(values[:n])
         for name, value in zip(measured, values[n:], strict=True):
             one.measurement[name] = value
@@ -358,7 +359,7 @@ def _tick_map(
     at = np.concatenate([slots.read(), [float(one.model[name][0]) for name in measured]])
     steps = [_STEP_A / words[name] if name in words else _step_of(name) for name in (*slots.names, *measured)]
     jacobian = _differences(run, at, np.array(steps))
-    one.restore(rest)
+    back_to_rest()
     return _split(jacobian, n), slots.names
 
 
