@@ -1,14 +1,13 @@
 """Final seeds are for a result, not for development: every run over them is written down before it begins.
 
-The record is a committed file. A run that was cut short goes on where it stopped, as long as no source has changed; any
-other start counts as one more run.
+The record is a committed file, and so is the journal of a run that takes longer than a machine is there: it goes on where
+it stopped, as long as no source has changed; any other start counts as one more run.
 """
 
 import dataclasses
 import hashlib
 import json
 import subprocess
-import tempfile
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 
 from bench.blind_sets import Searched
 from bench.figure import Figure
+from bench.journal import Journal
 
 FIRST_SEED = 1_000_000
 ROOT = Path(__file__).parent.parent
@@ -56,23 +56,20 @@ class FinalRun:
     """One run over the final seeds: its entry in the record, and what it has so far."""
 
     record: Path
-    digest: str
     number: int
-    journal: Path
+    journal: Journal
 
     def keep(self, one: Searched) -> None:
         """Keep what was found on one set, so that a run that is cut short need not search it again."""
-        path = self.journal / f"{one.seed}.json"
-        path.with_suffix(".part").write_text(json.dumps(dataclasses.asdict(one)))
-        path.with_suffix(".part").replace(path)
+        entry = dataclasses.asdict(one)
+        self.journal.keep(entry.pop("seed"), entry)
 
     def kept(self) -> dict[int, Searched]:
         """Return what was found before this run was cut short."""
-        found: dict[int, Searched] = {}
-        for path in self.journal.glob("*.json"):
-            row = json.loads(path.read_text())
-            found[row["seed"]] = Searched(**{**row, "reducible": tuple(row["reducible"])})
-        return found
+        return {
+            seed: Searched(seed=seed, **{**entry, "reducible": tuple(entry["reducible"])})
+            for seed, entry in self.journal.entries.items()
+        }
 
     def end(self, seeds: Iterable[int], figures: Iterable[Figure], took_s: float) -> None:
         """Write the result into the record."""
@@ -87,25 +84,27 @@ class FinalRun:
             "figures": [figure.as_json() | {"seeds": []} for figure in figures],
         }
         _write(self.record, content)
+        self.journal.end()
 
 
-def begin(record: Path = RECORD, journals: Path | None = None) -> FinalRun:
+def begin(record: Path = RECORD) -> FinalRun:
     """Count this run in the record, or go on with one that was cut short on the same sources."""
     digest = sources_digest()
-    journal = (journals or Path(tempfile.gettempdir())) / f"stagectl-gap-final-{digest}"
     content = _read(record)
     for row in content["runs"]:
-        if row["sources"] == digest and row["ended"] is None and journal.is_dir():
+        journal = _journal(record, row["number"])
+        if row["sources"] == digest and row["ended"] is None and journal.exists():
             row["continued"] = [*row.get("continued", []), _now()]
             _write(record, content)
-            return FinalRun(record, digest, row["number"], journal)
+            return FinalRun(record, row["number"], Journal(journal))
     number = len(content["runs"]) + 1
-    journal.mkdir(parents=True, exist_ok=True)
-    for path in journal.iterdir():  # of an earlier run that did end
-        path.unlink()
     content["runs"].append({"number": number, "commit": commit(), "sources": digest, "begun": _now(), "ended": None})
     _write(record, content)
-    return FinalRun(record, digest, number, journal)
+    return FinalRun(record, number, Journal(_journal(record, number)))
+
+
+def _journal(record: Path, number: int) -> Path:
+    return record.with_name(f"{record.stem}-run-{number}.jsonl")
 
 
 def _read(record: Path) -> dict[str, Any]:

@@ -20,27 +20,35 @@ def sources_hash() -> str:
     return digest.hexdigest()[:16]
 
 
-class Journal:
-    """Entries by seed; with a name, they are found again after an interruption."""
+def cached(name: str) -> Path:
+    """Return where the journal of a measurement with these sources is kept."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return cache / "stagectl-bench" / f"{name}-{sources_hash()}.jsonl"
 
-    def __init__(self, name: str | None):
+
+class Journal:
+    """Entries by seed; with a file, they are found again after an interruption."""
+
+    def __init__(self, path: Path | None):
         """Read what is there; None keeps nothing beyond this object."""
         self.entries: dict[int, dict[str, Any]] = {}
-        self._path: Path | None = None
-        if name is not None:
-            cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-            self._path = cache / "stagectl-bench" / f"{name}-{sources_hash()}.jsonl"
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            if self._path.exists():
-                whole = [line for line in self._path.read_text().splitlines(keepends=True) if line.endswith("}\n")]
-                self._path.write_text("".join(whole))  # without a last line that was cut off
-                for line in whole:
-                    entry = json.loads(line)
-                    self.entries[entry.pop("seed")] = entry
+        self._path = path
+        if path is not None and path.exists():
+            whole = [line for line in path.read_text().splitlines(keepends=True) if line.endswith("}\n")]
+            path.write_text("".join(whole))  # without a last line that was cut off
+            for line in whole:
+                entry = json.loads(line)
+                self.entries[entry.pop("seed")] = entry
 
     def keep(self, seed: int, entry: dict[str, Any]) -> None:
         """Add an entry, and write it at once."""
         self.entries[seed] = entry
         if self._path is not None:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("a") as file:
                 file.write(json.dumps({"seed": seed, **entry}) + "\n")
+
+    def end(self) -> None:
+        """Remove the file: what it was for is done."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)

@@ -177,11 +177,11 @@ def test_left_out():
 
 def test_final_seeds_are_counted_before_they_are_run_and_a_run_cut_short_goes_on(tmp_path, monkeypatch):
     record = tmp_path / "gap-results.json"
-    first = final_seeds.begin(record, tmp_path)
+    first = final_seeds.begin(record)
     assert json.loads(record.read_text())["final_seeds_were_run"] == 1
     row = one(1_000_000, "null").searched
     first.keep(row)
-    again = final_seeds.begin(record, tmp_path)  # it was cut short: no second run
+    again = final_seeds.begin(record)  # it was cut short: no second run
     assert again.number == 1
     assert again.kept() == {1_000_000: row}
     bar = Bar("x", "%", 2.0)
@@ -191,9 +191,10 @@ def test_final_seeds_are_counted_before_they_are_run_and_a_run_cut_short_goes_on
     assert content["runs"][0]["figures"][0]["holds"] is False
     assert content["runs"][0]["ended"]
     assert content["runs"][0]["commit"]
-    second = final_seeds.begin(record, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [record.name]  # its journal is done with
+    second = final_seeds.begin(record)
     assert second.number == 2
     assert second.kept() == {}
     monkeypatch.setattr(final_seeds, "sources_digest", lambda: "other")
-    assert final_seeds.begin(record, tmp_path).number == 3
+    assert final_seeds.begin(record).number == 3
     assert json.loads(record.read_text())["final_seeds_were_run"] == 3

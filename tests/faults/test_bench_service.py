@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench import service, service_batch, service_processes
-from bench.journal import Journal
+from bench.journal import Journal, cached
 from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
 from tests.faults import losses, real
@@ -62,11 +62,11 @@ def test_one_bad_run_is_a_missed_bar_and_says_how_to_see_it_again():
 
 def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    Journal("test").keep(4, {"line": "four"})
+    Journal(cached("test")).keep(4, {"line": "four"})
     (path,) = (tmp_path / "stagectl-bench").glob("test-*.jsonl")
     path.write_text(path.read_text() + '{"seed": 5, "li')  # killed in the middle of a line
-    Journal("test").keep(6, {"line": "six"})
-    assert Journal("test").entries == {4: {"line": "four"}, 6: {"line": "six"}}
+    Journal(cached("test")).keep(6, {"line": "six"})
+    assert Journal(cached("test")).entries == {4: {"line": "four"}, 6: {"line": "six"}}
     assert Journal(None).entries == {}
 
 
