@@ -1,7 +1,7 @@
 """Final seeds are for a result, not for development: every run over them is written down before it begins.
 
-The record is a committed file, and so is the journal of a run that takes longer than a machine is there: it goes on where
-it stopped, as long as no source has changed; any other start counts as one more run.
+The record is a committed file, and so is the journal of a run that takes longer than a machine is there: it goes on
+where it stopped, as long as no source has changed; any other start counts as one more run.
 """
 
 import dataclasses
