@@ -32,7 +32,7 @@ _TIMEOUT_S = 5.0
 _WAIT_S = 5.0
 _RENEWALS_PER_LEASE = 4
 _BLOCK_COUNT = 50
-_STOP_TRIES = 3
+_STOP_TRIES, _KEYED_TRIES = 3, 2
 _REST_S, _LOOK_S = 30.0, 0.05
 _WITHOUT_POWER = ("off", "idle", "fault")
 _KINDS = {
@@ -45,6 +45,10 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 def error_of(failure: messages.Failure) -> StagectlError:
     """Return the error that the service tells of."""
     return _KINDS.get(failure.kind, RequestError)(failure.message)
+
+
+def _new_key() -> str:
+    return f"client-{secrets.token_hex(12)}"
 
 
 def _blocks(positions_m: Iterable[float]) -> Iterator[tuple[list[float], bool]]:
@@ -114,10 +118,13 @@ class Client:
         """Return who may move the stage; None where nobody does."""
         return TypeAdapter(messages.LeaseState | None).validate_python(self._ask("GET", "/v1/lease"))
 
-    def take_lease(self, holder: str, duration_s: float = 2.0) -> messages.TakenLease:
-        """Take the lease; it has to be renewed within `duration_s`, again and again, or the stage stops."""
+    def take_lease(self, holder: str, duration_s: float = 2.0, key: str = "") -> messages.TakenLease:
+        """Take the lease; it has to be renewed within `duration_s`, again and again, or the stage stops.
+
+        The same key (16 characters or more) again gets the same lease, while that lasts.
+        """
         body = messages.TakeLease(holder=holder, duration_s=duration_s)
-        taken = messages.TakenLease.model_validate(self._ask("POST", "/v1/lease", body))
+        taken = messages.TakenLease.model_validate(self._once("POST", "/v1/lease", body, key))
         self.lease_token = taken.token
         return taken
 
@@ -127,7 +134,7 @@ class Client:
 
     def give_lease_back(self) -> None:
         """Give the lease back; a stage with power comes to rest."""
-        self._ask("DELETE", "/v1/lease")
+        self._once("DELETE", "/v1/lease")
         self.lease_token = ""
 
     @contextlib.contextmanager
@@ -217,11 +224,14 @@ class Client:
         return self.do("follow", messages.Follow(text=text, name=name or "trajectory", law=law))
 
     def send_setpoints(
-        self, first_number: int, period_s: float, position_m: list[float], last: bool = False
+        self, first_number: int, period_s: float, position_m: list[float], last: bool = False, key: str = ""
     ) -> messages.StreamState:
-        """Send set-points ahead, numbered from 0; the answer says what must come next and how many have room."""
+        """Send set-points ahead, numbered from 0; the answer says what must come next and how many have room.
+
+        `key` is the stream's, of the first answer or one's own; with it nothing goes into another stream.
+        """
         body = messages.Setpoints(first_number=first_number, period_s=period_s, position_m=position_m, last=last)
-        return messages.StreamState.model_validate(self._ask("PUT", "/v1/setpoints", body))
+        return messages.StreamState.model_validate(self._once("PUT", "/v1/setpoints", body, key))
 
     def stream_state(self) -> messages.StreamState | None:
         """Return how the stream under way stands; None where there is none."""
@@ -230,7 +240,7 @@ class Client:
     def stream(self, positions_m: Iterable[float], period_s: float) -> messages.Command:
         """Send positions ahead as fast as there is room, and wait for the end of the motion."""
         state: messages.StreamState | None = None
-        blocks = _blocks(positions_m)
+        blocks, key = _blocks(positions_m), _new_key()
         block, last = next(blocks, ([], True))
         while block:
             first_number = 0 if state is None else state.next_number
@@ -242,7 +252,7 @@ class Client:
                 state = stands
                 continue
             try:
-                state = self.send_setpoints(first_number, period_s, block, last)
+                state = self.send_setpoints(first_number, period_s, block, last, key)
             except RequestError as error:
                 if state is None or (command := self.command(state.key)).state not in ("done", "failed"):
                     raise
@@ -256,31 +266,27 @@ class Client:
 
     def stop(self) -> messages.Status:
         """Bring the stage to rest and take the power away; needs no lease. Tried again where the link fails."""
-        for _ in range(_STOP_TRIES - 1):
-            with contextlib.suppress(LinkError):
-                return messages.Status.model_validate(self._ask("POST", "/v1/stop"))
-        return messages.Status.model_validate(self._ask("POST", "/v1/stop"))
+        return messages.Status.model_validate(self._again(_STOP_TRIES, "POST", "/v1/stop"))
 
     def record(self, name: str = "request") -> messages.Status:
         """Begin a run, where none is under way; needs no lease."""
-        return messages.Status.model_validate(self._ask("POST", "/v1/record", messages.StartRecord(name=name)))
+        return messages.Status.model_validate(self._once("POST", "/v1/record", messages.StartRecord(name=name)))
 
     def end_record(self) -> messages.Status:
         """End the run that was asked for; needs no lease."""
-        return messages.Status.model_validate(self._ask("DELETE", "/v1/record"))
+        return messages.Status.model_validate(self._once("DELETE", "/v1/record"))
 
     def set_trigger(self, trigger: messages.SetTrigger) -> messages.Status:
         """Record what is around an event; needs no lease."""
-        return messages.Status.model_validate(self._ask("PUT", "/v1/record/trigger", trigger))
+        return messages.Status.model_validate(self._once("PUT", "/v1/record/trigger", trigger))
 
     def end_trigger(self) -> messages.Status:
         """Wait for no event any more; needs no lease."""
-        return messages.Status.model_validate(self._ask("DELETE", "/v1/record/trigger"))
+        return messages.Status.model_validate(self._once("DELETE", "/v1/record/trigger"))
 
     def begin(self, name: str, body: BaseModel, key: str = "") -> messages.Command:
         """Send a command and don't wait; the same key again is the same command."""
-        headers = {"Idempotency-Key": key or f"client-{secrets.token_hex(12)}"}
-        return messages.Command.model_validate(self._ask("POST", f"/v1/{name}", body, headers=headers))
+        return messages.Command.model_validate(self._once("POST", f"/v1/{name}", body, key))
 
     def command(self, key: str, wait_s: float = 0.0) -> messages.Command:
         """Return what became of a command; waits for its end where asked to."""
@@ -299,6 +305,23 @@ class Client:
         return found
 
     # ---- bytes -----------------------------------------------------------------------------------------------
+
+    def _once(self, method: str, path: str, body: BaseModel | None = None, key: str = "") -> Any:
+        """Ask for what is done once however often it is said; said again where the answer got lost."""
+        return self._again(_KEYED_TRIES, method, path, body, {"Idempotency-Key": key or _new_key()})
+
+    def _again(
+        self,
+        tries_count: int,
+        method: str,
+        path: str,
+        body: BaseModel | None = None,
+        headers: dict[str, str] | None = None,
+    ) -> Any:
+        for _ in range(tries_count - 1):
+            with contextlib.suppress(LinkError):
+                return self._ask(method, path, body, headers)
+        return self._ask(method, path, body, headers)
 
     def _ask(
         self,

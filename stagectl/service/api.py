@@ -21,6 +21,7 @@ from stagectl.service.lease import LeaseRefused
 from stagectl.service.run_list import RunList
 from stagectl.service.scope import COLUMNS
 from stagectl.service.service_log import ServiceLog
+from stagectl.service.used_keys import ANSWERS_COUNT
 
 _WAIT_STEP_S = 0.02
 _WAIT_MOST_S = 25.0
@@ -39,12 +40,16 @@ _REFUSALS: dict[int | str, dict[str, Any]] = {
         (403, "The token's role may not do this"),
         (409, "Not possible in this state, or another command is under way"),
         (413, "The body is too large"),
-        (422, "A value is not what it must be, or its key was used for another command"),
+        (422, "A value is not what it must be, or its key was used for another command, or long ago"),
         (423, "The lease on motion is another's, over, or was not given"),
         (503, "The service begins or ends"),
     )
 }
 
+IdempotencyLeaseKey = Annotated[
+    messages.LeaseKey | None,
+    Header(alias="Idempotency-Key", description="The same key gets the same lease again, while that lasts"),
+]
 LeaseToken = Annotated[
     str, Header(alias="Stagectl-Lease", max_length=200, description="Token of the lease; without it, 423")
 ]
@@ -163,9 +168,9 @@ def _lease_routes(app: FastAPI, desk: Desk) -> None:
         return desk.lease_state()
 
     @app.post("/v1/lease", dependencies=_OPERATES)
-    async def take(body: messages.TakeLease) -> messages.TakenLease:
+    async def take(body: messages.TakeLease, key: IdempotencyLeaseKey = None) -> messages.TakenLease:
         """Take the lease, where it is free; whoever has the token may move the stage until it runs out."""
-        return desk.take_lease(body)
+        return desk.take_lease(body, key or "")
 
     @app.put("/v1/lease", dependencies=_OPERATES)
     async def renew(token: LeaseToken = "") -> messages.TakenLease:
@@ -173,9 +178,9 @@ def _lease_routes(app: FastAPI, desk: Desk) -> None:
         return desk.renew_lease(token)
 
     @app.delete("/v1/lease", dependencies=_OPERATES, status_code=204)
-    async def give_back(token: LeaseToken = "") -> None:
+    async def give_back(key: IdempotencyKey = None, token: LeaseToken = "") -> None:
         """Give the lease back; a stage with power is brought to rest and disarmed."""
-        desk.give_lease_back(token)
+        desk.give_lease_back(token, key or "")
 
 
 def _command_routes(app: FastAPI, desk: Desk) -> None:
@@ -216,9 +221,12 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
         return desk.stream_state()
 
     @app.put("/v1/setpoints", status_code=202, dependencies=_OPERATES)
-    def setpoints(body: messages.Setpoints, token: LeaseToken = "") -> messages.StreamState:
-        """Send set-points ahead; number 0 begins. Where none comes in time the stage brakes and holds."""
-        return desk.take_setpoints(body, token)
+    def setpoints(body: messages.Setpoints, key: IdempotencyKey = None, token: LeaseToken = "") -> messages.StreamState:
+        """Send set-points ahead; number 0 begins. Where none comes in time the stage brakes and holds.
+
+        The key is the stream's, the same with every request of it.
+        """
+        return desk.take_setpoints(body, token, key or "")
 
     @app.post("/v1/jogging", status_code=202, dependencies=_OPERATES)
     async def begin_jog(
@@ -239,27 +247,27 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
         return desk.status()
 
     @app.post("/v1/record", status_code=202, dependencies=_OPERATES)
-    async def record(body: messages.StartRecord) -> messages.Status:
+    async def record(body: messages.StartRecord, key: IdempotencyKey = None) -> messages.Status:
         """Begin a run, where none is under way. Needs no lease; motions are recorded without asking."""
-        desk.ask_to_record(body.name)
+        desk.ask_to_record(body.name, key or "")
         return desk.status()
 
     @app.delete("/v1/record", status_code=202, dependencies=_OPERATES)
-    async def end_record() -> messages.Status:
+    async def end_record(key: IdempotencyKey = None) -> messages.Status:
         """End the run that was asked for. Needs no lease."""
-        desk.ask_to_record("")
+        desk.ask_to_record("", key or "")
         return desk.status()
 
     @app.put("/v1/record/trigger", status_code=202, dependencies=_OPERATES)
-    async def set_trigger(body: messages.SetTrigger) -> messages.Status:
+    async def set_trigger(body: messages.SetTrigger, key: IdempotencyKey = None) -> messages.Status:
         """Record what is around an event, beside whatever else is recorded. Needs no lease."""
-        desk.set_trigger(body)
+        desk.set_trigger(body, key or "")
         return desk.status()
 
     @app.delete("/v1/record/trigger", status_code=202, dependencies=_OPERATES)
-    async def end_trigger() -> messages.Status:
+    async def end_trigger(key: IdempotencyKey = None) -> messages.Status:
         """Wait for no event any more. Needs no lease."""
-        desk.set_trigger(None)
+        desk.set_trigger(None, key or "")
         return desk.status()
 
     @app.get("/v1/commands/{key}", responses={404: {"model": messages.Failure}})
@@ -271,7 +279,7 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
         while True:
             found = desk.command(key)
             if found is None:
-                raise HTTPException(404, f"no command with key {key!r}; the last 1000 are kept")
+                raise HTTPException(404, f"no command with key {key!r} is remembered; the last {ANSWERS_COUNT} are")
             if found.state in ("done", "failed") or time.monotonic() >= until_s:
                 return found
             await asyncio.sleep(_WAIT_STEP_S)

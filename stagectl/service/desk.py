@@ -8,23 +8,23 @@ import math
 import secrets
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Any
+
+from pydantic import BaseModel
 
 from stagectl.errors import JogOver, RequestError, StagectlError
 from stagectl.profile import Profile
 from stagectl.service import lease as leases
 from stagectl.service import messages, plans, states
-from stagectl.service.lease import Lease
+from stagectl.service.lease import Lease, LeaseRefused
 from stagectl.service.motions import MOTIONS
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import State
+from stagectl.service.used_keys import ANSWERS_COUNT, Used, UsedKeys, digest
 from stagectl.service.view import jog_velocity_m_per_s
 from stagectl.streaming import SetpointBuffer
-
-_KEPT_ORDERS_COUNT = 1000
 
 
 class Busy(RequestError):
@@ -32,7 +32,7 @@ class Busy(RequestError):
 
 
 class Unfit(RequestError):
-    """A value can't be on this stage, or a key was used for something else."""
+    """A value can't be on this stage, or a key was used for something else, or long ago."""
 
 
 class Ending(RequestError):
@@ -54,7 +54,7 @@ class Order:
         """Wait to be carried out; `plan` is what was planned for it."""
         self.key, self.name, self.token = key, name, token
         self.body: Any = body
-        """What it asks for; JSON once it was put by."""
+        """What it asks for, until it was put by."""
         self.plan: Any = None if plan is None else plan.motion
         """What was planned for it, until it is over."""
         self._remark = "" if plan is None else plan.remark
@@ -72,13 +72,8 @@ class Order:
         """Become small, where nothing more will become of it: a thousand of them are kept."""
         message = self._message
         if not isinstance(message, bytes) and self.over:
-            self.body = self.body.model_dump_json().encode()
+            self.body = None
             self._message = message.model_dump_json().encode()
-
-    def asks_for(self, name: str, body: Any) -> bool:
-        """Tell whether it is this command."""
-        same = self.body == (body.model_dump_json().encode() if isinstance(self.body, bytes) else body)
-        return self.name == name and same
 
     @property
     def over(self) -> bool:
@@ -128,6 +123,13 @@ def _unfit() -> Iterator[None]:
         raise Unfit(str(error)) from error
 
 
+def _stream_begun(order: Order, count: int) -> messages.StreamState:
+    """Say how a stream stands to who asks again whether it began, with so many set-points."""
+    buffer = order.plan
+    over = messages.StreamState(key=order.key, next_number=count, ahead_s=0.0, room_count=0)
+    return over if buffer is None else _stream_state(order.key, buffer)
+
+
 def _stream_state(key: str, buffer: SetpointBuffer) -> messages.StreamState:
     return messages.StreamState(
         key=key, next_number=buffer.next_number, ahead_s=buffer.ahead_s, room_count=buffer.room_count
@@ -142,7 +144,7 @@ class Desk:
         self._log, self._clock_s = log, clock_s
         self._lock = threading.RLock()
         self._lease: Lease | None = None
-        self._orders: OrderedDict[str, Order] = OrderedDict()
+        self._keys = UsedKeys()
         self._current: Order | None = None
         self._waiting: Order | None = None
         self._stop_reason = ""
@@ -237,15 +239,25 @@ class Desk:
             return None
         return messages.LeaseState(holder=lease.holder, left_s=left_s, duration_s=lease.duration_s)
 
-    def take_lease(self, body: messages.TakeLease) -> messages.TakenLease:
-        """Give the lease to a client. Errors: LeaseRefused, RequestError."""
+    def take_lease(self, body: messages.TakeLease, key: str = "") -> messages.TakenLease:
+        """Give the lease to a client; with the same key again, the same one. Errors: LeaseRefused, RequestError."""
         with self._lock:
+            used = self._used(key, "lease", body)
+            if used is not None:
+                return self._taken_before(key, used.answer)
             self._refuse_when_closed()
             token = secrets.token_urlsafe(24)
             now_s = self._clock_s()
             self._lease = leases.take(self._lease, token, body.holder, body.duration_s, now_s, self._busy)
+            self._keep(key, "lease", body, token)
             self._log.say("lease_taken", holder=body.holder, duration_s=body.duration_s)
             return self._taken(self._lease)
+
+    def _taken_before(self, key: str, token: str) -> messages.TakenLease:
+        try:
+            return self._taken(leases.holds(self._lease, token, self._clock_s()))
+        except LeaseRefused as error:
+            raise LeaseRefused(f"the lease that key {key!r} took is over; take another one with a new key") from error
 
     def renew_lease(self, token: str) -> messages.TakenLease:
         """Prolong a client's lease. Errors: LeaseRefused."""
@@ -253,12 +265,15 @@ class Desk:
             self._lease = leases.renew(self._lease, token, self._clock_s())
             return self._taken(self._lease)
 
-    def give_lease_back(self, token: str) -> None:
-        """End a client's lease; a stage with power is brought to rest. Errors: LeaseRefused."""
+    def give_lease_back(self, token: str, key: str = "") -> None:
+        """End a client's lease; a stage with power is brought to rest. Errors: LeaseRefused, Unfit."""
         with self._lock:
+            if self._used(key, "lease given back", token) is not None:
+                return
             held = leases.holds(self._lease, token, self._clock_s())
             busy = self._busy
             self._lease = leases.give_back(self._lease, token, self._clock_s(), busy)
+            self._keep(key, "lease given back", token)
             self._log.say("lease_given_back", holder=held.holder)
             if busy:
                 self.ask_to_stop(f"{held.holder} gave the lease back")
@@ -283,20 +298,26 @@ class Desk:
             self._drop_waiting(reason)
         self._log.say("stop", reason)
 
-    def ask_to_record(self, name: str) -> None:
-        """Begin a run, or end the one that was asked for (""); needs no lease. Errors: Busy, Ending."""
+    def ask_to_record(self, name: str, key: str = "") -> None:
+        """Begin a run, or end the one that was asked for (""); needs no lease. Errors: Busy, Ending, Unfit."""
         with self._lock:
+            if self._used(key, "record", name) is not None:
+                return
             self._refuse_when_closed()
             if self._record_request is not None:
                 raise Busy("another client asks the same just now; ask again")
             if self._state is State.OFF:
                 raise Busy("there is nothing to record: the stage is not connected")
             self._record_request = name
+            self._keep(key, "record", name)
             self._log.say("record", name or "end")
 
-    def set_trigger(self, body: messages.SetTrigger | None) -> None:
+    def set_trigger(self, body: messages.SetTrigger | None, key: str = "") -> None:
         """Wait for an event to record, or for none any more; needs no lease. Errors: Busy, Ending, Unfit."""
+        asked = "" if body is None else body
         with self._lock:
+            if self._used(key, "trigger", asked) is not None:
+                return
             self._refuse_when_closed()
             profile = self.profile
             if body is not None and profile is None:
@@ -311,7 +332,8 @@ class Desk:
                         f"before_s + after_s are {body.before_s + body.after_s:g} s, record.flight_s keeps "
                         f"{profile.record.flight_s:g} s; ask for less, or raise it"
                     )
-            self._trigger_request = "" if body is None else body
+            self._trigger_request = asked
+            self._keep(key, "trigger", asked)
             self._log.say("trigger", "none" if body is None else body.name)
 
     def _drop_waiting(self, reason: str) -> None:
@@ -322,25 +344,35 @@ class Desk:
     def submit_planned(self, name: str, body: Any, key: str, token: str) -> messages.Command:
         """Plan a scan or a table, check it, and take it over like `submit`; plans without the lock."""
         with self._lock:
-            if key in self._orders:
-                return self.submit(name, plans.kept(body), key, token)
+            used = self._used(key, name, plans.kept(body))
+            if used is not None:
+                return used.answer.message()
         profile, holds_m = self._where_it_holds(name, token)
         with _unfit():
             plan = plans.scanned(body, profile, holds_m) if name == "scan" else plans.followed(body, profile)
         return self.submit(name, plans.kept(body), key, token, plan)
 
-    def take_setpoints(self, body: messages.Setpoints, token: str) -> messages.StreamState:
-        """Begin a stream, or take what goes on with it. Errors: RequestError and kinds; then none of it is taken."""
+    def take_setpoints(self, body: messages.Setpoints, token: str, key: str = "") -> messages.StreamState:
+        """Begin a stream, or take what goes on with it; `key` is the stream's, the same with each of its blocks.
+
+        Errors: RequestError and kinds; then none of it is taken.
+        """
         with self._lock:
+            used = self._used(key, "setpoints", plans.kept(body)) if body.first_number == 0 else None
+            if used is not None:
+                return _stream_begun(used.answer, len(body.position_m))
             leases.holds(self._lease, token, self._clock_s())
             order = self._current
             known = order.plan if order is not None and order.name == "setpoints" and not order.over else None
+            begun_period_s = order.body.period_s if order is not None and known is not None else None
             if known is not None and self._stop.is_set():
                 raise Busy("the stage is coming to rest; wait until it stands")
         if order is not None and known is not None:
             with _unfit():
-                if body.period_s != order.body.period_s:
-                    raise RequestError(f"period_s is {body.period_s:g}, the stream began with {order.body.period_s:g}")
+                if key and key != order.key:
+                    raise RequestError(f"set-point {body.first_number} is of the stream {key}, not of {order.key}")
+                if body.period_s != begun_period_s:
+                    raise RequestError(f"period_s is {body.period_s:g}, the stream began with {begun_period_s:g}")
                 known.take(body.first_number, body.position_m, body.last)
             return _stream_state(order.key, known)
         if body.first_number != 0:
@@ -348,7 +380,7 @@ class Desk:
         profile, holds_m = self._where_it_holds("setpoints", token)
         with _unfit():
             plan = plans.streamed(body, profile, holds_m)
-        command = self.submit("setpoints", plans.kept(body), f"stream-{secrets.token_hex(8)}", token, plan)
+        command = self.submit("setpoints", plans.kept(body), key or f"stream-{secrets.token_hex(8)}", token, plan)
         return _stream_state(command.key, plan.motion)
 
     def stream_state(self) -> messages.StreamState | None:
@@ -373,11 +405,9 @@ class Desk:
     def submit(self, name: str, body: Any, key: str, token: str, plan: plans.Plan | None = None) -> messages.Command:
         """Take a command over, or return what became of it where its key was seen. Errors: RequestError and kinds."""
         with self._lock:
-            known = self._orders.get(key)
-            if known is not None:
-                if not known.asks_for(name, body):
-                    raise Unfit(f"key {key!r} was used for another {known.name}; take a new key for a new command")
-                return known.message()
+            used = self._used(key, name, body)
+            if used is not None:
+                return used.answer.message()
             self._refuse_when_closed()
             leases.holds(self._lease, token, self._clock_s())
             self._refuse_when_busy(name)
@@ -387,7 +417,7 @@ class Desk:
             order = Order(key, name, body, token, self._clock_s, plan)
             if name == "jogging":
                 order.hold(0.0, body.hold_s)
-            self._keep_order(order)
+            self._keep_order(order, digest(body))
             return order.message()
 
     def submit_own(self, name: str, body: Any) -> None:
@@ -400,11 +430,12 @@ class Desk:
         """Begin to jog, at rest, or brake the jog under way to go on with that. Errors: RequestError and kinds."""
         with self._lock:
             order = self._current
-            if key in self._orders or order is None or order.name != "jogging" or order.over:
+            if self._used(key, "jogging", body) is not None or order is None or order.name != "jogging" or order.over:
                 return self.submit("jogging", body, key, token)
             leases.holds(self._lease, token, self._clock_s())
             self._refuse_when_stopping("jogging")
             order.hold(0.0, body.hold_s)
+            self._keep(key, "jogging", body, order)
             return order.message()
 
     def jog_at(self, key: str, body: messages.JogAt, token: str) -> messages.Command:
@@ -424,17 +455,35 @@ class Desk:
             return order.message()
 
     def command(self, key: str) -> messages.Command | None:
-        """Return what became of a command; None where no such key was seen."""
+        """Return what became of a command; None where no such key was seen, or long ago."""
         with self._lock:
-            order = self._orders.get(key)
-        return None if order is None else order.message()
+            used, order = self._keys.find(key), self._current
+        if order is None or order.key != key:  # whoever waits for its end may wait while other keys are used
+            order = None if used is None else used.answer
+        return order.message() if isinstance(order, Order) else None
 
-    def _keep_order(self, order: Order) -> None:
+    def _keep_order(self, order: Order, asked: bytes) -> None:
         if self._current is not None:
             self._current.put_by()
-        self._orders[order.key] = self._current = self._waiting = order
-        while len(self._orders) > _KEPT_ORDERS_COUNT:
-            self._orders.popitem(last=False)
+        self._keys.keep(order.key, Used(order.name, asked, order))
+        self._current = self._waiting = order
+
+    def _used(self, key: str, name: str, asked: BaseModel | str) -> Used | None:
+        """Return what became of the same request; None where its key is new, or none was given. Errors: Unfit."""
+        used = self._keys.find(key)
+        if used is not None and not used.is_for(name, asked):
+            raise Unfit(f"key {key!r} was used for another {used.name}; take a new key for a new command")
+        if used is None and key and self._keys.was_used_long_ago(key):
+            raise Unfit(
+                f"key {key!r} was used more than {ANSWERS_COUNT} keys ago: what became of that is forgotten, and it is "
+                "not done again; look where the stage is, and take a new key for a new command"
+            )
+        return used
+
+    def _keep(self, key: str, name: str, asked: BaseModel | str, answer: Any = None) -> None:
+        """Remember what a key was used for, where one was given."""
+        if key:
+            self._keys.keep(key, Used(name, digest(asked), answer))
 
     def _refuse_when_closed(self) -> None:
         if self._closed:

@@ -6,6 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Key = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[A-Za-z0-9._:-]+$")]
+LeaseKey = Annotated[Key, Field(min_length=16)]
+"""Whoever says it again gets the lease: nothing to be guessed, or used twice by chance."""
 LawName = Literal["pid", "dsmc"]
 RunName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
@@ -117,6 +119,7 @@ class StreamBegun(BaseModel):
     """What is kept of the request that began a stream."""
 
     period_s: float
+    sha256: str
 
 
 class StreamState(BaseModel):

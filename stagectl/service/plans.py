@@ -1,6 +1,5 @@
 """What a request for a scan, a table or a stream becomes: a plan that was checked before anything moves. Pure."""
 
-import hashlib
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel
@@ -12,6 +11,7 @@ from stagectl.errors import RequestError
 from stagectl.motion import check, planned_limits, travel_from
 from stagectl.profile import Profile
 from stagectl.service import messages
+from stagectl.service.used_keys import digest
 from stagectl.streaming import Room, SetpointBuffer
 from stagectl.trajectory import Waypoint
 
@@ -26,11 +26,12 @@ class Plan(NamedTuple):
 
 
 def kept(body: BaseModel) -> BaseModel:
-    """Return what is kept of a request: tables go by their digest."""
+    """Return what is kept of a request: tables and set-points go by their digest."""
     if isinstance(body, messages.Follow):
-        digest = hashlib.sha256(body.text.encode("utf-8", "backslashreplace")).hexdigest()
-        return messages.Followed(name=body.name, law=body.law, sha256=digest)
-    return messages.StreamBegun(period_s=body.period_s) if isinstance(body, messages.Setpoints) else body
+        return messages.Followed(name=body.name, law=body.law, sha256=digest(body.text).hex())
+    if isinstance(body, messages.Setpoints):
+        return messages.StreamBegun(period_s=body.period_s, sha256=digest(body).hex())
+    return body
 
 
 def scanned(body: messages.Scan, profile: Profile, holds_m: float) -> Plan:

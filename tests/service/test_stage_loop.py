@@ -294,7 +294,7 @@ def test_what_is_said_to_a_jog_that_was_let_go_of_moves_nothing(armed):
 def test_a_stop_in_the_last_moment_of_a_jog_is_a_stop(armed):
     key = armed.desk.begin_jog(messages.BeginJog(), "last", armed.token).key
     armed.desk.jog_at(key, messages.JogAt(velocity_m_per_s=0.01), armed.token)
-    order = armed.desk._orders[key]
+    order = armed.desk._current
     before = order.wanted_m_per_s
 
     def then_stop():
