@@ -361,8 +361,11 @@ class Servo:
         self._phase_since_t_ns = t_ns
 
     def _end(self, stop: Stop, phase: Phase, t_ns: int, text: str = "") -> None:
-        """Latch why the run ended (the first reason stays) and go to the phase that brings the stage to rest."""
-        if self.stop is Stop.NONE:
+        """Latch why the run ended and go to the phase that brings the stage to rest.
+
+        The first reason stays; but who asked for rest has to hear of what broke on the way to it.
+        """
+        if self.stop is Stop.NONE or (self.stop in _UNPOWERED_STOPS and stop not in _UNPOWERED_STOPS):
             self.stop, self.text = stop, text
         elif phase is Phase.QUICK_STOP and text and text not in self.text:
             self.text = f"{self.text}; then {text}"
@@ -465,10 +468,13 @@ class Servo:
         number = self._asked.acknowledge_number
         if number != self._acknowledged and mode in (Mode.RESET, Mode.IDLE):
             self._acknowledged = number
+            if (
+                self.stop not in _UNPOWERED_STOPS
+            ):  # else whoever asked for rest has heard of none: the next arming tells
+                seen.emergency = 0
+                seen.store()
             self.stop = Stop.NONE
             self.text = ""
-            seen.emergency = 0
-            seen.store()
             self._enter(Phase.IDLE, t_ns)
             return off, off
         return self._stopped_targets(mode)

@@ -35,6 +35,7 @@ from stagectl.undisturbed import undisturbed
 _STEP_S = 0.02
 _SENSOR_TIMEOUT_S = 5.0
 _RESET_TIMEOUT_S = 2.0
+_REST_NOTED_S = 0.5
 _MODE_TIMEOUT_S = 0.5
 _NEWS_KEPT_COUNT = 100
 _STALL_S = 1.5  # without a cycle: three times what the servo grants this side
@@ -450,7 +451,10 @@ class Session:
         self._asked_to_stop = False
 
     def disarm(self) -> Stop:
-        """Bring the stage to rest under the law, then take the power away."""
+        """Bring the stage to rest under the law, then take the power away; returns what stopped it, or a drive at rest.
+
+        Drives in fault stay so: only an acknowledgement resets them.
+        """
         phase = self.status()["phase"]
         if phase in (Phase.IDLE, Phase.HOMED_DRIVE):
             return Stop.NONE
@@ -458,8 +462,14 @@ class Session:
         status = self._wait(lambda s: s["phase"] == Phase.STOPPED, 20.0, "stopping")
         self._holds_lease = False
         stop = Stop(int(status["stop"]))
-        if stop is Stop.OPERATOR:
-            self.acknowledge()
+        if stop is not Stop.OPERATOR:
+            return stop
+        failed = self._failed(status)
+        if failed:
+            self._reason = f"{' and '.join(failed)} in fault as the stage came to rest; its emergency says why"
+            return Stop.DRIVE_FAULT
+        self._request(mode=int(Mode.IDLE), acknowledge_number=self._counter + 1)
+        self._pump_until(lambda s: s["phase"] != Phase.STOPPED, _REST_NOTED_S)
         return stop
 
     def release(self) -> None:
