@@ -105,7 +105,12 @@ Amplitude = Annotated[float | None, _option("sine: half of its swing.")]
 Frequency = Annotated[float | None, _option("sine: frequency.")]
 Duration = Annotated[float | None, _option("sine: whole time, ramps included.")]
 Target = Annotated[float | None, _option("move: where to, from the homed zero.")]
-SweepFrequency = Annotated[float, _option("Frequency of the sweep over both edges.", min=0.05, max=5.0)]
+SweepFrequency = Annotated[
+    float | None,
+    _option(
+        "Frequency of the sweep over both edges (default: 1 Hz, less where the joint asks for it).", min=0.05, max=5.0
+    ),
+]
 SweepDuration = Annotated[float, _option("How long to sweep.", min=2.0, max=240.0)]
 Distance = Annotated[float | None, _option("How far, signed.", "--distance-m")]
 Keys = Annotated[bool, _option("Hold an arrow key to move; through a service only.", "--keys")]
@@ -256,7 +261,7 @@ def run(
 
 @app.command(epilog=_epilog("stagectl identify", "stagectl identify --frequency-hz 0.7 --duration-s 30"))
 def identify(
-    frequency_hz: SweepFrequency = 1.0,
+    frequency_hz: SweepFrequency = None,
     duration_s: SweepDuration = 20.0,
     profile: Profile = _PROFILE,
     backend: WireOrPlant = "auto",

@@ -55,6 +55,16 @@ def test_the_value_seam_identifies(capsys, tmp_path):
         assert found[f"{side}_stiffness_n_per_m"] == pytest.approx(found[f"{side}_stiffness_true_n_per_m"], rel=0.02)
 
 
+def test_without_a_frequency_the_sweep_is_as_slow_as_the_joint_asks_for(capsys, tmp_path):
+    asked = ("identify", "--profile", "kang-2023", "--backend", "plant", "--duration-s", "2", "--runs", tmp_path)
+    code, answer, _ = call_json(capsys, *asked)
+    assert code == 0
+    assert answer["backlash"]["width_m"] == pytest.approx(15.2e-3, rel=0.02)
+    code, answer, _ = call_json(capsys, *asked, "--frequency-hz", "1")
+    assert code == 2
+    assert "ask for at most 0.208 Hz" in answer["error"]["message"]
+
+
 def test_a_stage_of_one_axis_runs_behind_the_value_seam(capsys, tmp_path):
     code, answer, _ = call_json(
         capsys, "run", "-t", "sine", "--profile", "single-axis", "--backend", "plant", "--runs", tmp_path

@@ -46,6 +46,7 @@ class Voice:
     hush: Callable[[], None]  # from here on no signal interrupts
     run_folder: Path | None = field(default=None)
     whole_file: Path | None = field(default=None)  # a result that is there whatever comes after
+    left_behind: str = "nothing was recorded"  # by an interrupt, where this command has no run of its own
 
     def check(self) -> None:
         """Let an interrupt come out that was asked for."""
@@ -156,7 +157,7 @@ def _say_error(
 def _say_interrupted(command: str, as_json: bool, console: Console, voice: Voice) -> None:
     run = _existing_run(voice)
     kept = voice.whole_file
-    moved = "the stage was brought to rest and the run closed" if run is not None else "nothing was recorded"
+    moved = "the stage was brought to rest and the run closed" if run is not None else voice.left_behind
     if kept is not None:
         moved = f"{moved}; {kept} is whole" if run is not None else f"{kept} is whole, what was to follow is not there"
     console.print(f"[bold yellow]interrupted[/]: {moved}", highlight=False)

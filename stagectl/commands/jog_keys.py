@@ -62,7 +62,7 @@ def jog(voice: Voice, socket: Path | None, token: str | None, speed_m_per_s: flo
     """Home where it is needed, arm, and follow the keys until q."""
     if not sys.stdin.isatty():
         raise RequestError("--keys needs a terminal to read keys from; give --distance-m instead")
-    with connected(socket) as stage, leased(stage, token):
+    with connected(socket) as stage, leased(voice, stage, token):
         status = stage.status()
         voice.note(status.banner)
         if not status.homed:

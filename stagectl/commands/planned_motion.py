@@ -52,7 +52,7 @@ def stream(voice: Voice, socket: Path | None, token: str | None, period_s: float
     with remote.connected(socket) as stage:
         status = stage.status()
         voice.note(f"{status.profile} through the service: {status.banner}")
-        with remote.leased(stage, token):
+        with remote.leased(voice, stage, token):
             command = remote.prepared(voice, stage, status, "stream")
             if command is None:
                 command = stage.move(first)

@@ -21,7 +21,7 @@ from stagectl.service import messages
 from stagectl.service.places import default_socket, is_served
 
 _LEASE_S = 3.0
-_POLL_S = 0.2
+_POLL_S, _LOOK_S, _HEED_S = 0.2, 0.05, 3.0
 _FINISHED = "FINISHED"
 
 
@@ -50,14 +50,32 @@ def _holder() -> str:
 
 
 @contextmanager
-def leased(stage: Client, token: str | None) -> Iterator[None]:
-    """Work under a lease that somebody holds (`token`), or under one of our own that ends with the command."""
-    if token:
-        stage.lease_token = token
-        yield
+def leased(voice: Voice, stage: Client, token: str | None) -> Iterator[None]:
+    """Work under a lease that somebody holds (`token`), or under one of our own that ends with the command.
+
+    An interrupt leaves the stage at rest either way: a lease that goes on would have its motion go on too.
+    """
+    voice.left_behind = "the stage was brought to rest; what it did is in the service's run"
+    if not token:
+        with stage.lease(_holder(), _LEASE_S):
+            yield
         return
-    with stage.lease(_holder(), _LEASE_S):
+    stage.lease_token = token
+    try:
         yield
+    except KeyboardInterrupt:
+        _brought_to_rest(voice, stage)
+        raise
+
+
+def _brought_to_rest(voice: Voice, stage: Client) -> messages.Status:
+    found = stage.stop()
+    while found.state in ("arming", "armed", "moving", "identifying", "stopping"):
+        voice.progress("coming to rest", 0.0)
+        time.sleep(_LOOK_S)
+        found = stage.status()
+    voice.progress.done()
+    return found
 
 
 # ---- motion -------------------------------------------------------------------------------------------------------
@@ -78,7 +96,7 @@ def motion(
         status = stage.status()
         _refuse_other(status, profile, usual_profile, backend)
         voice.note(f"{status.profile} through the service: {status.banner}")
-        with leased(stage, token):
+        with leased(voice, stage, token):
             command = prepared(voice, stage, status, name)
             if command is None:
                 command = follow(voice, stage, name, body)
@@ -167,6 +185,7 @@ def watch(voice: Voice, socket: Path | None, as_json: bool, looks_count: int | N
     """Show where things stand, again and again, until Ctrl-C or so many looks."""
     from rich.live import Live
 
+    voice.left_behind = "the service goes on"
     with connected(socket) as stage:
         found = stage.status()
         if as_json:
@@ -178,8 +197,6 @@ def watch(voice: Voice, socket: Path | None, as_json: bool, looks_count: int | N
 
 
 def _look_again(voice: Voice, stage: Client, looks_count: int | None, show: Callable[[messages.Status], None]) -> None:
-    import time
-
     looks = 0
     while looks_count is None or looks < looks_count:
         show(stage.status())
@@ -271,11 +288,7 @@ def log(voice: Voice, socket: Path | None, lines_count: int) -> Answer:
 def stop(voice: Voice, socket: Path | None) -> Answer:
     """Bring the stage to rest, and wait until it has no power."""
     with connected(socket) as stage:
-        found = stage.stop()
-        while found.state in ("arming", "armed", "moving", "identifying", "stopping"):
-            voice.progress("coming to rest", 0.0)
-            found = stage.status()
-    voice.progress.done()
+        found = _brought_to_rest(voice, stage)
     voice.note(found.banner)
     return Answer({"state": found.state}, [f"stopped; the state is {found.state}"])
 
@@ -293,14 +306,14 @@ def fault(voice: Voice, socket: Path | None, token: str | None, acknowledge: boo
             escape(f"what to do: {found.remedy}"),
         ]
         if acknowledge:
-            with leased(stage, token):
+            with leased(voice, stage, token):
                 follow(voice, stage, "acknowledge", messages.Acknowledge(number=found.number))
             shown.append("acknowledged; nothing was enabled")
     data = {"fault": found.model_dump(), "acknowledged": acknowledge}
     return Answer(data, shown, 0 if acknowledge else ENDED_EARLY)
 
 
-def lease(voice: Voice, socket: Path | None, hold: bool) -> Answer:
+def lease(voice: Voice, socket: Path | None, hold: bool, as_json: bool) -> Answer:
     """Show who holds the lease, or hold it until Ctrl-C."""
     with connected(socket) as stage:
         voice.note(stage.status().banner)
@@ -309,7 +322,8 @@ def lease(voice: Voice, socket: Path | None, hold: bool) -> Answer:
             text = "free" if held is None else f"{held.holder}, {held.left_s:.1f} s left"
             return Answer({"lease": None if held is None else held.model_dump()}, [escape(text)])
         with stage.lease(_holder(), _LEASE_S) as taken:
-            print(f"export STAGECTL_LEASE={taken.token}", flush=True)
+            voice.left_behind = "the lease was given back; the stage is without power"
+            print(taken.model_dump_json() if as_json else f"export STAGECTL_LEASE={taken.token}", flush=True)
             voice.note("held until Ctrl-C; then the stage comes to rest without power")
             _look_again(voice, stage, None, lambda seen: _still_ours(seen, taken.holder))
     return Answer({}, [])
@@ -322,14 +336,16 @@ def _still_ours(seen: messages.Status, holder: str) -> None:
 
 def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> Answer:
     """Show what is recorded, begin a run, or end the one that was asked for."""
+    if end and name is not None:
+        raise RequestError(f"--name {name} and --end are both given; give one of them")
     with connected(socket) as stage:
-        if end or name is not None:
-            if end:
-                stage.end_record()
-            else:
-                stage.record(checked("StartRecord", name=name).name)  # pyright: ignore[reportAttributeAccessIssue]
-            time.sleep(_POLL_S)
         status = stage.status()
+        if end:
+            stage.end_record()
+            status = _once_heeded(stage, lambda found: found is None or found.trigger != "request")
+        elif name is not None:
+            stage.record(checked("StartRecord", name=name).name)  # pyright: ignore[reportAttributeAccessIssue]
+            status = _once_heeded(stage, lambda found: found is not None and bool(found.run or found.trouble))
     voice.note(status.banner)
     found = status.recording
     text = "nothing: the stage is not connected"
@@ -339,18 +355,28 @@ def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> An
     return Answer({"recording": None if found is None else found.model_dump()}, shown)
 
 
+def _once_heeded(stage: Client, heeded: Callable[[messages.Recording | None], bool]) -> messages.Status:
+    """Return the status that shows what was asked of the recording, or the newest where that takes too long."""
+    give_up_s = time.monotonic() + _HEED_S
+    while not heeded((found := stage.status()).recording) and time.monotonic() < give_up_s:
+        time.sleep(_LOOK_S)
+    return found
+
+
 def trigger(voice: Voice, socket: Path | None, body: dict | None, reversal: bool, end: bool) -> Answer:
     """Show which event is waited for, set one, or end that."""
     if reversal and body is not None and (body["error_m"] is not None or body["contact_force_n"] is not None):
         raise RequestError("--reversal and a level are both given; give one of them")
+    if end and body is not None:
+        raise RequestError("--end and an event are both given; give one of them")
     with connected(socket) as stage:
+        status = stage.status()
         if end:
             stage.end_trigger()
+            status = _once_heeded(stage, lambda found: found is None or not found.waits_for)
         elif body is not None:
             stage.set_trigger(messages.SetTrigger.model_validate(checked("SetTrigger", **body).model_dump()))
-        if end or body is not None:
-            time.sleep(_POLL_S)
-        status = stage.status()
+            status = _once_heeded(stage, lambda found: found is not None and bool(found.waits_for))
     voice.note(status.banner)
     found = status.recording
     waits_for = "" if found is None else found.waits_for
@@ -362,7 +388,7 @@ def backend(voice: Voice, socket: Path | None, token: str | None, name: str | No
     with connected(socket) as stage:
         if name is not None:
             asked = checked("SwapBackend", backend=name)
-            with leased(stage, token):
+            with leased(voice, stage, token):
                 follow(voice, stage, "backend", asked)
         found = stage.status()
     shown = [found.banner, *([f"waiting for {escape(found.waiting_for)}"] if found.waiting_for else [])]

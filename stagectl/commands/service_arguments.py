@@ -115,8 +115,11 @@ def fault(
 
 @service_app.command(epilog=epilog("stagectl lease", "stagectl lease --hold"))
 def lease(hold: Hold = False, socket: Socket = None, json: Json = False) -> None:
-    """Show who may move the stage, or hold the lease for other commands ($STAGECTL_LEASE)."""
-    deliver("lease", json, lambda voice: commands.remote.lease(voice, socket, hold), compiles=False)
+    """Show who may move the stage, or hold the lease for other commands ($STAGECTL_LEASE).
+
+    What is held is one line on stdout: for a shell, or with --json an object before the last.
+    """
+    deliver("lease", json, lambda voice: commands.remote.lease(voice, socket, hold, json), compiles=False)
 
 
 @service_app.command(epilog=epilog("stagectl backend", "stagectl backend rig"))
