@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from motions import SCAN
 from stage_pc import PORT, UNIT, check, report, rig, servo_pid, shell, stage, unit, until
 
 FAR_M, STRUCK_M = 0.1, 0.03
@@ -22,7 +23,7 @@ SERVO_STOPS_S = DRIVES_STOP_S + 2.0
 REST_PATIENCE_S = 60.0
 STEP_S = 2.0
 RUNS = Path("/var/lib/stagectl/runs")
-MEMORY_SHARE = 0.7  # of what the servo has locked: enough for the supervisor alone
+REPEATED_COUNT = 8  # of the scan: it outlasts two steps of the clock
 
 
 @contextmanager
@@ -109,16 +110,27 @@ def recorded() -> None:
 
 
 def clock_stepped() -> None:
-    """Somebody sets the clock, an hour on and back: nothing happens."""
+    """Somebody sets the clock in the midst of a scan, an hour on and back: it goes on and is recorded without a gap."""
+    known = {run["name"] for run in stage.ask("GET", "/v1/runs")}
     with stage.lease():
-        stage.do("arm")
+        stage.do("arm" if stage.status()["homed"] else "home")
         before = stage.status()["health"]
+        scan = stage.begin("scan", **SCAN | {"repeat_count": REPEATED_COUNT})
+        until("the scan is under way", lambda: stage.status()["state"] == "moving")
         for step in ("+1 hour", "-1 hour"):
             shell("date", "--set", step)
             time.sleep(STEP_S)
+        check("clock stepped: that was in the midst of the scan", stage.status()["state"] == "moving")
+        stage.finish("scan", scan)
         after = stage.status()
-        went_on = after["health"]["cycles_count"] - before["cycles_count"] > STEP_S * before["rate_hz"]
-        check("clock stepped: it holds the stage", went_on and after["state"] == "armed", after["fault"])
+        check("clock stepped: it holds the stage behind the scan", after["state"] == "armed", after["fault"])
+    stage.await_state("idle")
+    (run,) = [run for run in stage.ask("GET", "/v1/runs") if run["name"] not in known]
+    check("clock stepped: its run is listed and closed", run["state"] == "closed", run["name"])
+    missed_count = after["health"]["missed_cycles_count"] - before["missed_cycles_count"]
+    cycles_count = run["duration_s"] * before["rate_hz"]
+    found = f"{run['rows_count']} rows in {run['duration_s']:.2f} s, {missed_count} missed"
+    check("clock stepped: it has every cycle", abs(run["rows_count"] + missed_count - cycles_count) < 2.0, found)
 
 
 def can_down() -> None:
@@ -183,27 +195,55 @@ def _without_supervisor(what: str, number: signal.Signals) -> None:
     recovers(what)
 
 
-def out_of_memory() -> None:
-    """The kernel kills for want of memory while the drive homes: the stage stops, and it goes on without a hand."""
-    before, supervisor = int(unit("NRestarts")), int(unit("MainPID"))
+def servo_out_of_memory() -> None:
+    """The kernel kills the servo for want of memory while the drive homes: the drives stop, and it goes on by hand."""
+    what, before = "servo out of memory", int(unit("NRestarts"))
+    _without_memory(what, servo_pid(), int(unit("MainPID")), DRIVES_STOP_S)
+    check(f"{what}: the service is the same", int(unit("NRestarts")) == before)
+    faulted(what, "LinkError")
+    recovers(what)
+
+
+def supervisor_out_of_memory() -> None:
+    """The kernel kills the supervisor for want of memory while the drive homes: the servo stops the stage."""
+    what, before = "supervisor out of memory", int(unit("NRestarts"))
+    _without_memory(what, int(unit("MainPID")), servo_pid(), SERVO_STOPS_S)
+    await_restart(what, before)
+    recovers(what)
+
+
+def _without_memory(what: str, victim: int, spared: int, limit_s: float) -> None:
+    """Have the kernel kill one process of the service for want of memory, and none but that; the stage has to stop.
+
+    Anonymous memory can't be written out where there is no swap: less of it than there is ends a process for sure.
+    """
     group = Path(f"/sys/fs/cgroup{unit('ControlGroup')}")
 
-    def killed() -> int:
-        return int(dict(line.split() for line in (group / "memory.events").read_text().splitlines())["oom_kill"])
+    def facts(name: str) -> dict[str, int]:
+        return {
+            word: int(number) for word, number in (line.split() for line in (group / name).read_text().splitlines())
+        }
 
+    def killed() -> list[str]:
+        said = shell("journalctl", "-k", "--no-pager", "-o", "cat").splitlines()
+        return [line.split("Killed process ")[1].split()[0] for line in said if "Killed process" in line]
+
+    earlier, events = killed(), facts("memory.events")["oom_kill"]
     with homing():
-        facts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        Path(f"/proc/{victim}/oom_score_adj").write_text("1000")
+        Path(f"/proc/{spared}/oom_score_adj").write_text("-1000")
         began_s = time.monotonic()
-        (group / "memory.max").write_text(str(round(MEMORY_SHARE * int(facts["unevictable"]))))
-        until("the kernel kills", killed, period_s=0.02)
-        # There is memory again. The supervisor may be gone, too: the servo's 600 MB are not free at once.
+        limit_bytes = facts("memory.stat")["anon"] - _anonymous_bytes(victim) // 2
+        (group / "memory.max").write_text(str(limit_bytes))
+        until("the kernel kills", lambda: facts("memory.events")["oom_kill"] > events, period_s=0.02)
         (group / "memory.max").write_text("max")
-        stops("out of memory", began_s, SERVO_STOPS_S)
-    said = shell("journalctl", "-k", "--no-pager", "-o", "cat").splitlines()
-    names = [line.split("Killed process ")[1].split(",")[0] for line in said if "Killed process" in line]
-    check("out of memory: the kernel killed", names, names)
-    if supervisor != int(unit("MainPID")):
-        await_restart("out of memory", before)
-    else:
-        faulted("out of memory", "LinkError")
-    recovers("out of memory")
+        stops(what, began_s, limit_s)
+    found = killed()[len(earlier) :]
+    check(f"{what}: the kernel killed just that", found == [str(victim)], f"{found}, {limit_bytes >> 20} MB")
+    if os.path.exists(f"/proc/{spared}"):
+        Path(f"/proc/{spared}/oom_score_adj").write_text("0")
+
+
+def _anonymous_bytes(pid: int) -> int:
+    status = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return 1024 * int(next(line for line in status if line.startswith("RssAnon")).split()[1])

@@ -12,12 +12,13 @@ from pathlib import Path
 from breakage import (
     can_down,
     clock_stepped,
-    out_of_memory,
     recorded,
     serial_unplugged,
     servo_killed,
+    servo_out_of_memory,
     supervisor_hung,
     supervisor_killed,
+    supervisor_out_of_memory,
 )
 from installation import confined, everything, installed, ready, removed, upgraded
 from motions import moved
@@ -32,8 +33,8 @@ GROUPS: dict[str, tuple[tuple[Group, ...], tuple[Group, ...]]] = {
     "motion": (
         (ready, opened),
         (
-            serial_unplugged, servo_killed, supervisor_killed, supervisor_hung, out_of_memory,
-            moved, clock_stepped, can_down, recorded,
+            serial_unplugged, servo_killed, supervisor_killed, supervisor_hung, servo_out_of_memory,
+            supervisor_out_of_memory, moved, clock_stepped, can_down, recorded,
         ),
     ),
 }  # fmt: skip

@@ -187,7 +187,10 @@ class Stage:
 
     def do(self, name: str, patience_s: float = PATIENCE_S, **body: Any) -> dict[str, Any]:
         """Send a command and wait for its end; Failed where it failed or was stopped."""
-        key = self.begin(name, **body)
+        return self.finish(name, self.begin(name, **body), patience_s)
+
+    def finish(self, name: str, key: str, patience_s: float = PATIENCE_S) -> dict[str, Any]:
+        """Wait for the end of a command that was begun; Failed where it failed or was stopped."""
         done = until(f"end of {name}", lambda: self._ended(key), patience_s)
         if done["state"] == "failed" or done["stop"] not in ("", "FINISHED"):
             raise Failed(f"{name}: {done['stop'] or done['error']}: {done['text']}: {self.status()['fault']}")
