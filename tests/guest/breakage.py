@@ -23,7 +23,7 @@ SERVO_STOPS_S = DRIVES_STOP_S + 2.0
 REST_PATIENCE_S = 60.0
 STEP_S = 2.0
 RUNS = Path("/var/lib/stagectl/runs")
-REPEATED_COUNT = 8  # of the scan: it outlasts two steps of the clock
+REPEATED_COUNT = 4  # of the scan: it outlasts two steps of the clock
 
 
 @contextmanager
