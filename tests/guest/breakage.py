@@ -113,8 +113,8 @@ def clock_stepped() -> None:
     """Somebody sets the clock in the midst of a scan, an hour on and back: it goes on and is recorded without a gap."""
     known = {run["name"] for run in stage.ask("GET", "/v1/runs")}
     with stage.lease():
-        stage.do("arm" if stage.status()["homed"] else "home")
         before = stage.status()["health"]
+        stage.do("arm" if stage.status()["homed"] else "home")
         scan = stage.begin("scan", **SCAN | {"repeat_count": REPEATED_COUNT})
         until("the scan is under way", lambda: stage.status()["state"] == "moving")
         for step in ("+1 hour", "-1 hour"):
