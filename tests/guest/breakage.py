@@ -126,7 +126,7 @@ def clock_stepped() -> None:
     stage.await_state("idle")
     (run,) = [run for run in stage.ask("GET", "/v1/runs") if run["name"] not in known]
     check("clock stepped: its run is listed and closed", run["state"] == "closed", run["name"])
-    # Emulated, a row in 170 was not there, with one missed cycle in all: why is not known. An hour would be 360,000 rows.
+    # Emulated, a row in 170 was not there, with one missed cycle in all; why is not known. An hour is 360,000 rows.
     cycles_count = run["duration_s"] * after["health"]["rate_hz"]
     found = f"{run['rows_count']} rows in {run['duration_s']:.2f} s"
     check("clock stepped: no hour stands in it", 0.9 * cycles_count < run["rows_count"] < 1.1 * cycles_count, found)
