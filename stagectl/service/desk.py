@@ -147,6 +147,8 @@ class Desk:
         self._keys = UsedKeys()
         self._current: Order | None = None
         self._waiting: Order | None = None
+        self._own: Order | None = None  # the service's own command, that others wait for
+        self._own_began_m: float | None = None  # where the stage held then, and will again
         self._stop_reason = ""
         self._stop = threading.Event()
         self._record_request: str | None = None
@@ -395,9 +397,8 @@ class Desk:
         with self._lock:
             self._refuse_when_closed()
             leases.holds(self._lease, token, self._clock_s())
-            profile, status = self.profile, self._status
-            states.after(self._state, MOTIONS[name].event)
-        holds_m = None if status is None else status.positions.setpoint_position_m
+            profile, holds_m = self.profile, self._setpoint_m
+            states.after(self._state_then, MOTIONS[name].event)
         if profile is None or holds_m is None:
             raise RequestError(f"{name}: the stage is not connected; `stagectl status` says what it waits for")
         return profile, holds_m
@@ -412,7 +413,7 @@ class Desk:
             leases.holds(self._lease, token, self._clock_s())
             self._refuse_when_busy(name)
             if name in MOTIONS:
-                states.after(self._state, MOTIONS[name].event)
+                states.after(self._state_then, MOTIONS[name].event)
             self._check_values(name, body)
             order = Order(key, name, body, token, self._clock_s, plan)
             if name == "jogging":
@@ -421,10 +422,32 @@ class Desk:
             return order.message()
 
     def submit_own(self, name: str, body: Any) -> None:
-        """Submit a command of the service's own, under the lease that somebody holds; not where one is under way."""
+        """Submit a command of the service's own, under the lease that somebody holds; not where one is under way.
+
+        It leaves the stage as it found it: what clients ask for meanwhile waits for its end, instead of being refused.
+        """
         with self._lock, contextlib.suppress(RequestError):
             if self._lease is not None:
+                holds_m = self._setpoint_m
                 self.submit(name, body, f"own-{secrets.token_hex(8)}", self._lease.token)
+                self._own, self._own_began_m = self._current, holds_m
+
+    @property
+    def _own_is_under_way(self) -> bool:
+        """Whether the service's own command is what the stage does, or does next."""
+        return self._own is not None and self._current is self._own and not self._own.over
+
+    @property
+    def _state_then(self) -> State:
+        """The state in which a command begins that is taken over now."""
+        return State.ARMED if self._own_is_under_way and self._state is State.IDENTIFYING else self._state
+
+    @property
+    def _setpoint_m(self) -> float | None:
+        """Where the stage holds when such a command begins; None where nobody knows."""
+        if self._own_is_under_way:
+            return self._own_began_m
+        return None if self._status is None else self._status.positions.setpoint_position_m
 
     def begin_jog(self, body: messages.BeginJog, key: str, token: str) -> messages.Command:
         """Begin to jog, at rest, or brake the jog under way to go on with that. Errors: RequestError and kinds."""
@@ -463,6 +486,7 @@ class Desk:
         return order.message() if isinstance(order, Order) else None
 
     def _keep_order(self, order: Order, asked: bytes) -> None:
+        self._drop_waiting(f"{order.name} came first")  # the service's own, if any
         if self._current is not None:
             self._current.put_by()
         self._keys.keep(order.key, Used(order.name, asked, order))
@@ -495,7 +519,7 @@ class Desk:
 
     def _refuse_when_busy(self, name: str) -> None:
         self._refuse_when_stopping(name)
-        if self._current is not None and not self._current.over:
+        if self._current is not None and not self._current.over and not self._own_is_under_way:
             raise Busy(f"{name}: {self._current.name} is under way; wait for its end, or stop it")
 
     def _check_values(self, name: str, body: Any) -> None:

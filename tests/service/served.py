@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 
 from stagectl.client import Client
 from stagectl.service.access import Access
@@ -18,8 +19,9 @@ _BREATH_S = 1e-4  # for the thread that answers
 class Served:
     """A bench whose loop works in a thread of its own; leases run out where `now_s` is set ahead, and only then."""
 
-    def __init__(self, folder, profile="single-axis"):
+    def __init__(self, folder, profile="single-axis", machine=None):
         self.bench = Bench(folder, str(profile))
+        self.bench.loop.settings = replace(self.bench.settings, machine=machine)
         self.desk, self.log = self.bench.desk, self.bench.log
         self.bench.until(lambda: self.bench.loop._state == "idle")
         self.bench.loop.step()
@@ -30,7 +32,7 @@ class Served:
         self.socket = folder / "stage.socket"
         api = application(self.desk, self.log, self.bench.figures, folder / "runs", "0")
         self._listener = Listener([(listen_unix(self.socket), Access(api, None))])
-        self._over = threading.Event()
+        self._over, self._step = threading.Event(), threading.Lock()
         self._working = threading.Thread(target=self._work, daemon=True)
         self.client = Client(self.socket)
         self._listener.start()
@@ -38,18 +40,26 @@ class Served:
 
     def _work(self):
         while not self._over.is_set():
-            self.bench.loop.step()
+            with self._step:
+                self.bench.loop.step()
             time.sleep(_BREATH_S)
 
     @property
     def stage(self):
-        """The supervisor object; look at it while the stage rests."""
+        """The supervisor object."""
         return self.bench.loop._stage
 
     @property
     def plant(self):
-        """What is true of the stage now."""
-        return self.stage.backend.rig.plant_state()
+        """What is true of the stage now, where no command is under way."""
+        with self._step:
+            return self.stage.backend.rig.plant_state()
+
+    @property
+    def truth(self):
+        """What was true so far, one element a sample."""
+        with self._step:
+            return self.stage.backend.truth()
 
     def until(self, done):
         """Look again and again; fails after a while."""
