@@ -87,8 +87,7 @@ class Order:
 
     def progress(self, what: str, share: float) -> None:
         """Say how far it is."""
-        if not self.over:
-            self._change(text=what, share=min(max(share, 0.0), 1.0))
+        self._change(text=what, share=min(max(share, 0.0), 1.0))
 
     def finish(self, text: str, stop: str, run: str, backlash: messages.Backlash | None) -> None:
         """It came to an end; `stop` says which."""
@@ -103,7 +102,8 @@ class Order:
         self._change(state="failed", text=str(error), error=failure)
 
     def _change(self, **changes: Any) -> None:
-        self._message = self.message().model_copy(update=changes)
+        if not self.over:  # what was told once stays so
+            self._message = self.message().model_copy(update=changes)
 
     def hold(self, velocity_m_per_s: float, hold_s: float) -> None:
         """Have a jog go on at this velocity for so long."""

@@ -88,16 +88,30 @@ class StageLoop(StageWatch):
             self._log.say("command", order.name, key=order.key, body=order.body.model_dump())
             self._work(order.name)(order)
         except StagectlError as error:
-            order.fail(error)
             self._log.say("command_failed", str(error), name=order.name, key=order.key, kind=type(error).__name__)
             if isinstance(error, RequestError):
                 self._after_refusal()
+                self._make_public()
+                order.fail(error)
             else:
                 self._break(error)
         finally:
             self._order = None
             if not self._stop_wanted and self._stage is not None:
                 self._stage.allow_motion()
+
+    def _finish(
+        self, order: Order, text: str, stop: str = "", run: str = "", backlash: messages.Backlash | None = None
+    ) -> None:
+        """Say how a command ended."""
+        self._make_public()
+        order.finish(text, stop, run, backlash)
+
+    def _make_public(self) -> None:
+        """Have all see what a command made of the stage: who hears of its end asks for the next thing at once."""
+        if self.desk.stop_asked:
+            self._come_to_rest()
+        self.show()
 
     def _work(self, name: str) -> Callable[[Order], None]:
         """Return what carries a command out."""
@@ -140,7 +154,7 @@ class StageLoop(StageWatch):
         backlash = self._kept_backlash(outcome, folder.name) if motion.identifies else None
         if backlash is not None and self._wear is not None:
             self._wear.found(outcome.backlash, PROBE if order.name == "probe" else IDENTIFIED)
-        order.finish(outcome.text, outcome.stop.name, str(folder), backlash)
+        self._finish(order, outcome.text, outcome.stop.name, str(folder), backlash)
         self._log.say("command_done", outcome.text, name=order.name, key=order.key, stop=outcome.stop.name)
 
     def _care_for_joint(self) -> None:
@@ -207,7 +221,7 @@ class StageLoop(StageWatch):
             self._enter(Event.ACKNOWLEDGE, "acknowledged")
         self._fault = None
         self._memory.keep(fault=None)
-        order.finish("acknowledged; nothing was enabled", "", "", None)
+        self._finish(order, "acknowledged; nothing was enabled")
 
     def _do_backend(self, order: Order) -> None:
         if self._state not in (State.OFF, State.IDLE):
@@ -219,11 +233,11 @@ class StageLoop(StageWatch):
             self._close_stage()
             self._backend, self._backend_asked, self._retry_at_s = chosen, order.body.backend, 0.0
             self._memory.keep(profile=str(profile.source_path), backend=chosen, swapped_from=self.settings.backend)
-        order.finish(BANNERS[chosen], "", "", None)
+        self._finish(order, BANNERS[chosen])
 
     def _do_reread(self, order: Order) -> None:
         if self._state not in (State.OFF, State.IDLE):
             raise RequestError(f"the profile is read again without power only; the state is {self._state}: stop first")
         load_profile(self._profile_asked)
         self._reread()
-        order.finish("the profile was read again", "", "", None)
+        self._finish(order, "the profile was read again")

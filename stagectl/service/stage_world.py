@@ -152,6 +152,8 @@ class StageWorld(StageState):
         self._breaking = True  # the run ends when the last rows are in it
         self._trip(self._fault_of(error))
         self._tick()  # said at once: closing may take as long as a servo that hangs is given
+        if self._order is not None:
+            self._order.fail(error)
         self._close_stage()
         self._breaking = False
 

@@ -11,7 +11,7 @@ from stagectl.outcome import BacklashEstimate
 from stagectl.profile import PROFILES_FOLDER
 from stagectl.requests import Mode
 from stagectl.service import messages
-from stagectl.service.desk import Busy, Desk, Ending, Unfit
+from stagectl.service.desk import Busy, Desk, Ending, Order, Unfit
 from stagectl.service.exposition import Figures
 from stagectl.service.lease import LeaseRefused
 from stagectl.service.notify import Notifier
@@ -64,7 +64,6 @@ class Bench:
         """Submit and carry out; returns the finished command."""
         key = self.begin(name, body)
         self.until(lambda: self.desk.command(key).state in ("done", "failed"))
-        self.loop.step()
         return self.desk.command(key)
 
     def inject(self, *faults):
@@ -138,6 +137,27 @@ def test_moves_hold_and_are_refused_where_they_must(armed):
     assert failed.state == "failed"
     assert "the travel" in failed.error.message
     assert armed.status.state == "armed"
+
+
+def test_whoever_hears_of_an_end_sees_the_state_that_it_left(armed, monkeypatch):
+    seen = []
+
+    def heard(order, change=Order._change, **changes):
+        change(order, **changes)
+        if order.over:
+            seen.append((order.name, armed.status.state, armed.loop._state.value))
+
+    monkeypatch.setattr(Order, "_change", heard)
+    armed.do("move", messages.Move(target_m=0.004))
+    armed.do("jog", messages.JogBy(distance_m=0.9 * armed.desk.profile.macro.travel_m[1] * 2))
+    armed.desk.ask_to_stop("enough")
+    armed.until(lambda: armed.status.state == "idle")
+    armed.do("arm", messages.Arm())
+    armed.do("acknowledge", messages.Acknowledge(number=1))
+    armed.inject(Fault("emergency", node_id=1, code=ENCODER_FAULT))
+    armed.do("move", messages.Move(target_m=-0.004))
+    left = [(name, "armed", "armed") for name in ("move", "jog", "arm", "acknowledge")]
+    assert seen == [*left, ("move", "fault", "fault")]
 
 
 def test_the_same_key_is_the_same_command(armed):
