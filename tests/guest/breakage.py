@@ -128,8 +128,8 @@ def clock_stepped() -> None:
     stage.await_state("idle")
     (run,) = [run for run in stage.ask("GET", "/v1/runs") if run["name"] not in known]
     check("clock stepped: its run is listed and closed", run["state"] == "closed", run["name"])
-    # Emulated, the servo is woken up too late for one cycle in 120, and counts each; so it does at rest, before and behind.
-    # The first and the last row come up to 40 ms late.
+    # Emulated, the servo is woken up too late for one cycle in 120, and counts each; so it does at rest, before and
+    # behind. The first and the last row come up to 40 ms late.
     missed_count = stage.status()["health"]["missed_cycles_count"] - before["missed_cycles_count"]
     cycles_count = run["duration_s"] * before["rate_hz"] + 1.0
     found = f"{run['rows_count']} rows in {run['duration_s']:.2f} s, {missed_count} missed"
