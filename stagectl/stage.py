@@ -98,11 +98,11 @@ def open_stage(
             else RigBackend(profile, truth_of, seed=seed, plays=chosen)
         )
     facts = {
-        **(manifest or {}),
+        "backend_asked": backend,
+        **(manifest or {}),  # a caller that resolved `auto` itself says so there
         "name": name,
         "host": socket.gethostname(),
         "version": metadata.version("stagectl"),
-        "backend_asked": backend,
         "seeds": [seed],
     }
     try:

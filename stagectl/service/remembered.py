@@ -29,6 +29,8 @@ class Remembered(BaseModel):
     profile_name: str = ""
     backend: str = ""
     """World that was open last, or was asked for since."""
+    backend_asked: str = ""
+    """What was asked for when that world was chosen: `auto`, or the world itself."""
     swapped_from: str = ""
     """What the service was started with when a client chose that world; empty where none did."""
     joints: dict[str, Backlash] = {}

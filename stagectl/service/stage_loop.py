@@ -230,9 +230,15 @@ class StageLoop(StageWatch):
         chosen = choose(profile, order.body.backend)
         self._log.say("backend", BANNERS[chosen], backend=chosen, asked=order.body.backend, before=self._backend)
         if chosen != self._backend:
-            self._close_stage()
-            self._backend, self._backend_asked, self._retry_at_s = chosen, order.body.backend, 0.0
-            self._memory.keep(profile=str(profile.source_path), backend=chosen, swapped_from=self.settings.backend)
+            asked, began_with = order.body.backend, self.settings.backend
+            self._backend, self._backend_asked = chosen, asked
+            self._memory.keep(
+                profile=str(profile.source_path),
+                backend=chosen,
+                backend_asked=asked,
+                swapped_from="" if asked == began_with else began_with,  # back to how it was started: no swap any more
+            )
+            self._open_anew()
         self._finish(order, BANNERS[chosen])
 
     def _do_reread(self, order: Order) -> None:

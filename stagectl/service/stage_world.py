@@ -20,6 +20,7 @@ from stagectl.stage import choose, open_stage
 _RETRY_S, _RETRY_AFTER_FAILURE_S = 2.0, 5.0
 _CONNECT_S = 240.0  # a cold compile cache on a slow host
 _CLOSE_S = 60.0  # coming to rest, rows to the disk
+_OPENING = "opening the stage"
 ENDING = "the service was asked to end"
 """Why the stage comes to rest at the service's end."""
 
@@ -37,8 +38,9 @@ class StageWorld(StageState):
         try:
             profile = self._profile = load_profile(self._profile_asked)
             if not self._backend:
-                self._backend, self._backend_asked = self._world_to_begin_with(profile)
-                self._log.say("backend", BANNERS[self._backend], backend=self._backend, asked=self._backend_asked)
+                self._backend, self._backend_asked, because = self._world_to_begin_with(profile)
+                facts = {"backend": self._backend, "asked": self._backend_asked, "because": because}
+                self._log.say("backend", BANNERS[self._backend], **facts)
             absent = missing(profile, self._backend, self.settings.runs_root)
             if absent:
                 self._wait_for(absent)
@@ -49,7 +51,7 @@ class StageWorld(StageState):
         except RequestError as error:
             self._trip(self._fault_of(error))
             return
-        self._wait_for("opening the stage")
+        self._wait_for(_OPENING)
         self._notifier.allow(_CONNECT_S)
         folder: Path | None = None
         self._opening = True
@@ -91,11 +93,16 @@ class StageWorld(StageState):
                 self._recording.discard(folder)
             self._retry_at_s = time.monotonic() + _RETRY_AFTER_FAILURE_S
         self.desk.profile = stage.profile
-        self._memory.keep(profile=str(profile.source_path), profile_name=profile.name, backend=self._backend)
+        self._memory.keep(
+            profile=str(profile.source_path),
+            profile_name=profile.name,
+            backend=self._backend,
+            backend_asked=self._backend_asked,
+        )
         self._enter(Event.CONNECTED, stage.backend.description)
 
-    def _world_to_begin_with(self, profile: Profile) -> tuple[str, str]:
-        """Return the world and what asked for it: a client before the restart, else how the service was started.
+    def _world_to_begin_with(self, profile: Profile) -> tuple[str, str, str]:
+        """Return the world, what was asked for, and by whom: a client before the restart, else the service's start.
 
         A swap counts for the profile it was made with and for as long as the service is started in the same way. Where
         `auto` once found hardware, hardware that is late at the next start is waited for.
@@ -103,11 +110,11 @@ class StageWorld(StageState):
         asked, kept = self._backend_asked, self._memory.now
         if kept.profile == str(profile.source_path):
             if kept.swapped_from == asked:
-                return kept.backend, "a client before the restart"
+                return kept.backend, kept.backend_asked or kept.backend, "a client before the restart"
             if asked == "auto" and kept.backend == "hardware" and not kept.swapped_from:
-                return kept.backend, "auto, at an earlier start"
+                return kept.backend, asked, "auto found it at an earlier start"
         self._memory.keep(swapped_from="")
-        return choose(profile, asked), asked
+        return choose(profile, asked), asked, "the service's start"
 
     def _wait_for(self, what: str) -> None:
         if what != self._waiting_for:
@@ -144,8 +151,13 @@ class StageWorld(StageState):
             self._log.say("profile", f"kept as it was: {error}")
             return
         self._log.say("profile", "read again", profile=self._profile_asked)
+        self._open_anew()
+
+    def _open_anew(self) -> None:
+        """Let go of the world; the loop opens one at its next step, and says until then what it waits for."""
         self._close_stage()
         self._retry_at_s = 0.0
+        self._wait_for(_OPENING)
 
     def _break(self, error: StagectlError) -> None:
         """What broke on this side: bring the stage to rest, let go of it, and say so."""
