@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.service.daemon import Daemon
+from tests.service.daemon import Daemon, at_rest
 
 
 @pytest.fixture(scope="package")
@@ -18,9 +18,4 @@ def daemon(tmp_path_factory):
 @pytest.fixture
 def idle(daemon):
     """The daemon without power, whatever the last test left, or the host did meanwhile."""
-    daemon.recovers()
-    yield daemon
-    daemon.until(lambda: daemon.client.status().state in ("idle", "fault", "off"), "rest")
-    daemon.recovers()
-    daemon.state_is("idle")
-    daemon.until(lambda: daemon.client.lease_state() is None, "a free lease")
+    yield from at_rest(daemon)

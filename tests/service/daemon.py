@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from stagectl.backend import ask_rig
@@ -27,11 +28,34 @@ PATIENT = {  # limits that a busy test host does not pass
 }
 
 
-class Daemon:
-    """A service of its own, with everything that it leaves below one folder."""
+IN_VIRTUAL_TIME = """
+import sys
+from pathlib import Path
+from stagectl.service.daemon import serve
+from stagectl.service.stage_state import Settings
 
-    def __init__(self, folder: Path, changes: dict = PATIENT, runs: Path | None = None, profile: str = "single-axis"):
+profile, socket, state, runs = sys.argv[1:]
+sys.setswitchinterval(2e-4)  # its stage never waits: 5 ms are lost whenever the thread that answers wants to go on
+serve(Settings(profile, "batch", Path(runs), Path(state)), Path(socket), None)
+"""
+
+
+class Daemon:
+    """A service of its own, with everything that it leaves below one folder.
+
+    In virtual time no host can starve its servo; it works as fast as it can.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        changes: dict = PATIENT,
+        runs: Path | None = None,
+        profile: str = "single-axis",
+        in_virtual_time: bool = False,
+    ):
         self.folder = folder
+        self._in_virtual_time = in_virtual_time
         (folder / "tmp").mkdir(parents=True)
         self.profile = folder / "patient.toml"
         self.profile.write_text(changed(PROFILES_FOLDER / f"{profile}.toml", changes))
@@ -46,8 +70,12 @@ class Daemon:
 
     def start(self):
         """Start the service, as systemd does, and does again."""
-        command = [sys.executable, "-m", "stagectl.cli", "serve", str(self.profile), "--backend", "rig", "--tcp", "0"]
-        command += ["--socket", str(self.socket), "--state", str(self.state), "--runs", str(self.runs)]
+        socket, state, runs = str(self.socket), str(self.state), str(self.runs)
+        if self._in_virtual_time:
+            command = [sys.executable, "-c", IN_VIRTUAL_TIME, str(self.profile), socket, state, runs]
+        else:
+            command = [sys.executable, "-m", "stagectl.cli", "serve", str(self.profile), "--backend", "rig"]
+            command += ["--tcp", "0", "--socket", socket, "--state", state, "--runs", runs]
         self.process = subprocess.Popen(
             command,
             stderr=self.err,
@@ -137,6 +165,16 @@ class Daemon:
                 self.process.wait()
         self.notes.close()
         self.err.close()
+
+
+def at_rest(daemon: Daemon) -> Iterator[Daemon]:
+    """Have it without power before a test, and behind it."""
+    daemon.recovers()
+    yield daemon
+    daemon.until(lambda: daemon.client.status().state in ("idle", "fault", "off"), "rest")
+    daemon.recovers()
+    daemon.state_is("idle")
+    daemon.until(lambda: daemon.client.lease_state() is None, "a free lease")
 
 
 def servo_pid(daemon: Daemon) -> int:

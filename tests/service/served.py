@@ -17,13 +17,10 @@ _BREATH_S = 1e-4  # for the thread that answers
 
 
 class Served:
-    """A bench whose loop works in a thread of its own.
+    """A bench whose loop works in a thread of its own; leases run out where `now_s` is set ahead, and only then."""
 
-    Leases run out where `now_s` is set ahead, and only then; with a clock of their own as they do on it.
-    """
-
-    def __init__(self, folder, profile="single-axis", machine=None, clock_s=None):
-        self.bench = Bench(folder, str(profile), clock_s=clock_s)
+    def __init__(self, folder, profile="single-axis", machine=None):
+        self.bench = Bench(folder, str(profile))
         self.bench.loop.settings = replace(self.bench.settings, machine=machine)
         self.desk, self.log = self.bench.desk, self.bench.log
         self.bench.until(lambda: self.bench.loop._state == "idle")
