@@ -208,17 +208,23 @@ class BatchWire:
     def _deliver(self) -> None:
         """Hand the next frame on the bus to whom it concerns, through the faults of the wire."""
         t_ns, station, can_id, payload = self.bus.deliver()
+        for data in self._passed(t_ns, station, can_id, payload):
+            self._arrive(t_ns, station, can_id, data)
+
+    def _passed(self, t_ns: int, station: int, can_id: int, payload: bytes) -> list[bytes]:
+        """Let a frame through the faults of the wire; returns what arrives now, and holds back what arrives later."""
         faults = self.rig.wire_faults
         if faults.is_clean:
-            self._arrive(t_ns, station, can_id, payload)
-            return
+            return [payload]
         self._bus_is_on()
+        arrived = []
         for delay_ns, data in faults.passed(can_id, payload):
             if delay_ns == 0:
-                self._arrive(t_ns, station, can_id, data)
+                arrived.append(data)
             else:
                 self._delayed_count += 1
                 heapq.heappush(self._delayed, (t_ns + delay_ns, self._delayed_count, station, can_id, data))
+        return arrived
 
     def _arrive(self, t_ns: int, station: int, can_id: int, payload: bytes) -> None:
         if station == _HOST:
@@ -238,20 +244,23 @@ class BatchWire:
         """Deliver a frame of the master at the present instant, answers included: no time passes, the bus is not
         loaded."""
         rig = self.rig
-        answers = rig.on_frame(can_id, payload, max(self.t_ns, rig.t_ns))
-        if can_id == 0x000 or can_id & 0x780 == 0x600:
-            self._sync_cob_id = rig.nodes[0].sync_cob_id
-        for t_ns, own_id, data in rig.take_frames():
-            self._give(t_ns, own_id, data)
-        for answer_id, data in answers:
-            self._give(self.t_ns, answer_id, data)
+        for data in self._passed(self.t_ns, _HOST, can_id, payload):
+            answers = rig.on_frame(can_id, data, max(self.t_ns, rig.t_ns))
+            if can_id == 0x000 or can_id & 0x780 == 0x600:
+                self._sync_cob_id = rig.nodes[0].sync_cob_id
+            for t_ns, own_id, own in rig.take_frames():
+                self._give(t_ns, own_id, own)
+            for answer_id, answer in answers:
+                self._give(self.t_ns, answer_id, answer)
 
     def _give(self, t_ns: int, can_id: int, payload: bytes) -> None:
         """Give a drive's frame to the master at once, or put it on the bus where it belongs to the servo."""
+        station = self._station(can_id)
         if can_id < 0x580:
-            self.bus.submit(self._station(can_id), max(t_ns, self.t_ns), can_id, payload)
-        else:
-            self.network_bus.put(can_id, payload, t_ns)
+            self.bus.submit(station, max(t_ns, self.t_ns), can_id, payload)
+            return
+        for data in self._passed(t_ns, station, can_id, payload):
+            self.network_bus.put(can_id, data, t_ns)
 
 
 def attach_all(wire: BatchWire, listeners: Iterable[Any]) -> None:

@@ -206,6 +206,40 @@ def test_a_lost_and_a_late_frame(machine, wire_of):
     ]
 
 
+def test_what_the_master_asks_goes_through_the_faults_too(machine, wire_of):
+    faults = [
+        Fault("drop_frame", at_s=0.010, count=1, can_id=0x581),
+        Fault("drop_frame", at_s=0.010, count=1, can_id=0x602),
+        Fault("corrupt_frame", at_s=0.030, count=1, can_id=0x581, bits=0x1),
+        Fault("bus_off", at_s=0.040, duration_s=0.010),
+        Fault("delay_frame", at_s=0.060, count=1, can_id=0x581, delay_s=2e-3),
+    ]
+    wire, heard = wire_of(machine, faults), []
+    start_t_ns = wire.t_ns
+    wire.network_bus.attach(lambda can_id, data, t_s: heard.append((can_id, data[0])))
+
+    def asked(node_id):
+        """What is heard at once of a question for object 0x1000."""
+        heard.clear()
+        payload = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])
+        wire.network_bus.send(can.Message(arbitration_id=0x600 + node_id, data=payload, is_extended_id=False))
+        return [(can_id, first) for can_id, first in heard if can_id & 0x780 == 0x580]
+
+    answers = {node_id: [(0x580 + node_id, 0x43)] for node_id in (1, 2)}
+    assert [asked(1), asked(2)] == [answers[1], answers[2]]
+    wire.advance_to(start_t_ns + 12 * MS)
+    assert [asked(1), asked(2)] == [[], []]
+    assert [asked(1), asked(2)] == [answers[1], answers[2]]
+    wire.advance_to(start_t_ns + 32 * MS)
+    assert asked(1) == [(0x581, 0x42)]
+    wire.advance_to(start_t_ns + 42 * MS)
+    assert [asked(1), asked(2)] == [[], []]
+    wire.advance_to(start_t_ns + 62 * MS)
+    assert asked(1) == []
+    wire.advance_to(start_t_ns + 65 * MS)
+    assert [(can_id, first) for can_id, first in heard if can_id == 0x581] == answers[1]
+
+
 def test_bus_off_is_seen_by_both_ends(machine, wire_of):
     wire = wire_of(machine, [Fault("bus_off", at_s=0.020, duration_s=0.005)])
     arm(wire)

@@ -61,6 +61,11 @@ class Served:
         with self._step:
             return self.stage.backend.truth()
 
+    def inject(self, *faults):
+        """Have the rig do what a drive, a cable or a sensor may, where no command is under way."""
+        with self._step:
+            self.bench.inject(*faults)
+
     def until(self, done):
         """Look again and again; fails after a while."""
         give_up_s = time.monotonic() + PATIENCE_S
