@@ -70,8 +70,9 @@ class Serial:
 class Threads:
     """Threads of this process: compiled laws and numpy let go of the interpreter, and nothing has to travel.
 
-    Two processes were faster at the search of shapes alone (1.8 against 1.4 times one thread's speed), but have to be
-    started, load the compiled code, and hold the recordings twice.
+    Two processes were faster at the search of shapes alone (1.8 against 1.4 times one thread's speed), but not at a
+    whole search with several effects: 97 s with two threads, 135 s with one, 137 s with processes that are forked for
+    each `map` and forget the columns of its trials, more than 250 s on a cluster of two.
     """
 
     is_elsewhere = False
