@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,9 @@ def sources_hash() -> str:
     return digest.hexdigest()[:16]
 
 
-def cached(name: str) -> Path:
-    """Return where the journal of a measurement with these sources is kept."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return cache / "stagectl-bench" / f"{name}-{sources_hash()}.jsonl"
+def beside_figures(name: str) -> Path:
+    """Return where the journal of a measurement with these sources is kept: committed, it goes on elsewhere."""
+    return _ROOT / "docs" / "journals" / f"{name}-{sources_hash()}.jsonl"
 
 
 class Journal:

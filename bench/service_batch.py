@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from bench.figure import Bar, Figure, judged
-from bench.journal import Journal, cached
+from bench.journal import Journal, beside_figures
 from tests.faults import campaign
 from tests.faults.judge import BACK, BARS, BEGUN_CYCLES, GENTLE, LOST, TRAVEL
 from tests.faults.kinds import KINDS
@@ -29,7 +29,7 @@ Say = Callable[[str], None]
 def figures(*, full: bool, say: Say, seeds: Sequence[int] | None = None) -> Iterator[Figure]:
     """Play the seeds, or go on with what the journal has not; then judge them together."""
     wanted = list(seeds) if seeds is not None else list(range(FULL_RUNS if full else RUNS))
-    journal = Journal(cached("service-batch") if full and seeds is None else None)
+    journal = Journal(beside_figures("service-batch") if full and seeds is None else None)
     missing = [seed for seed in wanted if seed not in journal.entries]
     with tempfile.TemporaryDirectory(prefix="stagectl-faults-") as folder:
         for count, entry in enumerate(_played(missing, Path(folder)), 1):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from bench.figure import Bar, Figure, absent, judged
-from bench.journal import Journal, cached
+from bench.journal import Journal, beside_figures
 from tests.faults import losses, real, soak
 from tests.faults.judge import BACK, BARS, BEGUN, GENTLE, LOST, TRAVEL
 from tests.faults.kinds import CYCLE_S
@@ -38,7 +38,7 @@ Say = Callable[[str], None]
 def figures(*, full: bool, say: Say, seeds: Sequence[int] | None = None) -> Iterator[Figure]:
     """Play the seeds with real processes, or go on with what the journal has not."""
     wanted = list(seeds) if seeds is not None else list(range(FULL_RUNS) if full else SEEDS)
-    journal = Journal(cached("service-processes") if full and seeds is None else None)
+    journal = Journal(beside_figures("service-processes") if full and seeds is None else None)
     with tempfile.TemporaryDirectory(prefix="stagectl-real-") as folder:
         for seed in wanted:
             if seed in journal.entries:
