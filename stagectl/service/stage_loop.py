@@ -147,6 +147,8 @@ class StageLoop(StageWatch):
         self._enter(motion.event, order.name)
         if not motion.needs_homing:
             self._homed = False
+        if order.name == "probe" and self._wear is not None:
+            self._wear.probe_begun()  # one that another command came before is due again when the stage holds
         outcome = motion.work(stage, order)
         if not motion.needs_homing:
             self._homed = outcome.finished

@@ -120,16 +120,17 @@ class WearWatch:
             self._log.say("backlash_replaced", f"the compensation believes {estimate.width_m * 1e6:.2f} um from now on")
 
     def probe_due(self) -> bool:
-        """Tell whether the profile wants both edges touched now; says yes once in `wear.probe_every_s`."""
+        """Tell whether the profile wants both edges touched now, `wear.probe_every_s` after it was known last."""
         every_s, now_s = self._profile.wear.probe_every_s, self._now_s()
         if self._tracker is None or every_s is None:
             return False
         newest = self._tracker.newest
         known_s = max(self._probed_s, -math.inf if newest is None else newest.t_s)
-        if now_s - known_s < every_s:
-            return False
-        self._probed_s = now_s
-        return True
+        return now_s - known_s >= every_s
+
+    def probe_begun(self) -> None:
+        """A probe begins; whatever becomes of it, the next is not due before `wear.probe_every_s`."""
+        self._probed_s = self._now_s()
 
     def message(self) -> messages.Wear | None:
         """Say what is known of the joint now; None where nothing ever was."""

@@ -130,7 +130,9 @@ def test_a_probe_is_due_where_it_is_permitted_and_nothing_else_told_of_the_joint
     assert not Watched(oled_profile).watch.probe_due()
     one = Watched(oled_profile, probe_every_s=60.0)
     assert one.watch.probe_due()
-    assert not one.watch.probe_due()  # once, whatever became of it
+    assert one.watch.probe_due()  # until one begins, whatever becomes of that
+    one.watch.probe_begun()
+    assert not one.watch.probe_due()
     one.now_s += 61.0
     one.work(joint(oled_profile), 3.0, -3.0)
     assert not one.watch.probe_due()
