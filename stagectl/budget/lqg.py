@@ -252,11 +252,10 @@ class Loop:
         for k, (_, _, row, now) in enumerate(self._between):
             between[k, : row.size] = row
             between[k] += now * command
-        peak = 0.0
-        for _ in range(_STEP_PERIODS):
-            peak = max(peak, float(np.max(np.abs(between @ state))))
-            state = a @ state
-        return peak / _NM
+        states, periods = state[:, None], a  # one column a period, twice as many each time: a third of a search's time
+        while states.shape[1] < _STEP_PERIODS:
+            states, periods = np.hstack([states, periods @ states]), periods @ periods
+        return float(np.max(np.abs(between @ states[:, :_STEP_PERIODS]))) / _NM
 
     def robustness(self) -> Robustness:
         """Return loop gain, greatest sensitivity and delay margin; the filter is fed what the regulator asks."""

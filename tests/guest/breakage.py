@@ -23,6 +23,7 @@ SERVO_STOPS_S = DRIVES_STOP_S + 2.0
 REST_PATIENCE_S = 60.0
 STEP_S = 2.0
 RUNS = Path("/var/lib/stagectl/runs")
+LATE_CYCLES = 8
 REPEATED_COUNT = 4  # of the scan: it outlasts two steps of the clock
 
 
@@ -112,6 +113,7 @@ def recorded() -> None:
 def clock_stepped() -> None:
     """Somebody sets the clock in the midst of a scan, an hour on and back: it goes on and is recorded without a gap."""
     known = {run["name"] for run in stage.ask("GET", "/v1/runs")}
+    before = stage.status()["health"]
     with stage.lease():
         stage.do("arm" if stage.status()["homed"] else "home")
         scan = stage.begin("scan", **SCAN | {"repeat_count": REPEATED_COUNT})
@@ -126,10 +128,13 @@ def clock_stepped() -> None:
     stage.await_state("idle")
     (run,) = [run for run in stage.ask("GET", "/v1/runs") if run["name"] not in known]
     check("clock stepped: its run is listed and closed", run["state"] == "closed", run["name"])
-    # Emulated, a row in 170 was not there, with one missed cycle in all; why is not known. An hour is 360,000 rows.
-    cycles_count = run["duration_s"] * after["health"]["rate_hz"]
-    found = f"{run['rows_count']} rows in {run['duration_s']:.2f} s"
-    check("clock stepped: no hour stands in it", 0.9 * cycles_count < run["rows_count"] < 1.1 * cycles_count, found)
+    # Emulated, the servo is woken up too late for one cycle in 120, and counts each; so it does at rest, before and
+    # behind. The first and the last row come up to 40 ms late.
+    missed_count = stage.status()["health"]["missed_cycles_count"] - before["missed_cycles_count"]
+    cycles_count = run["duration_s"] * before["rate_hz"] + 1.0
+    found = f"{run['rows_count']} rows in {run['duration_s']:.2f} s, {missed_count} missed"
+    whole = cycles_count - missed_count - LATE_CYCLES < run["rows_count"] < cycles_count + LATE_CYCLES
+    check("clock stepped: it has every cycle that there was", whole, found)
     check("clock stepped: it is as long as it took", run["duration_s"] < REST_PATIENCE_S * 10.0, found)
 
 

@@ -17,10 +17,13 @@ _BREATH_S = 1e-4  # for the thread that answers
 
 
 class Served:
-    """A bench whose loop works in a thread of its own; leases run out where `now_s` is set ahead, and only then."""
+    """A bench whose loop works in a thread of its own.
 
-    def __init__(self, folder, profile="single-axis", machine=None):
-        self.bench = Bench(folder, str(profile))
+    Leases run out where `now_s` is set ahead, and only then; with a clock of their own as they do on it.
+    """
+
+    def __init__(self, folder, profile="single-axis", machine=None, clock_s=None):
+        self.bench = Bench(folder, str(profile), clock_s=clock_s)
         self.bench.loop.settings = replace(self.bench.settings, machine=machine)
         self.desk, self.log = self.bench.desk, self.bench.log
         self.bench.until(lambda: self.bench.loop._state == "idle")
@@ -76,6 +79,7 @@ class Served:
     def recovers(self):
         """Leave it idle, without a lease, a fault, a run or a trigger."""
         self.bench.now_s += 100.0
+        self.until(lambda: self.desk.lease_state() is None)
         self.state_is("idle", "fault")
         fault = self.desk.status().fault
         if fault is not None:

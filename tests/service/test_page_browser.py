@@ -16,6 +16,7 @@ from stagectl.profile import PROFILES_FOLDER
 from stagectl.service.access import Role
 from tests.service.daemon import REST_M_PER_S
 from tests.service.pages import PageServer, ServiceInVirtualTime
+from tests.service.served import Served
 from tests.toml_text import changed
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -42,8 +43,26 @@ def page_server(daemon):
 
 
 @pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    """A stage in virtual time, for what moves: on a busy host a browser starves a servo that keeps real time."""
+    made = Served(tmp_path_factory.mktemp("served"), clock_s=time.monotonic)
+    made.server = PageServer(made.socket, made.bench.settings.runs_root)
+    yield made
+    made.server.end()
+    made.close()
+
+
+@pytest.fixture
+def steady(served):
+    """That stage without power, a fault or a lease."""
+    served.recovers()
+    yield served
+    served.recovers()
+
+
+@pytest.fixture(scope="module")
 def worn_page_server(tmp_path_factory):
-    """A stage with a joint whose profile allows next to no wear, in virtual time: a browser starves no servo there."""
+    """A stage with a joint whose profile allows next to no wear, in virtual time, too."""
     folder = tmp_path_factory.mktemp("worn")
     profile = folder / "worn.toml"
     profile.write_text(changed(PROFILES_FOLDER / "oled-printer.toml", {"wear": {"width_change_limit_m": 1e-6}}))
@@ -96,21 +115,19 @@ def opened(opened_at, page_server):
     return functools.partial(opened_at, page_server)
 
 
+@pytest.fixture
+def steady_page(opened_at, steady):
+    """Open the page of the stage in virtual time: a function."""
+    return functools.partial(opened_at, steady.server)
+
+
 def state_is(page, *states):
     expect(page.locator("#state")).to_have_attribute("data-state", re.compile("|".join(states)), timeout=PATIENCE_MS)
-
-
-def idle_without_home(page):
-    """Tell whether the stage has to be homed; a test before may have done it."""
-    state_is(page, "idle")
-    return page.locator("#doing").get_attribute("data-homed") == "false"
 
 
 def armed_page(opened, **how):
     page = opened(Role.OPERATE, **how)
     page.click("#take")
-    if idle_without_home(page):
-        page.click("#home")  # ends without power on a stage that has no micro
     page.click("#arm")
     state_is(page, "armed")
     return page
@@ -122,8 +139,8 @@ def press(page, button):
     page.mouse.down()
 
 
-def velocity_m_per_s(daemon):
-    return abs(daemon.plant["macro_velocity_m_per_s"])
+def velocity_m_per_s(served):
+    return abs(served.plant["macro_velocity_m_per_s"])
 
 
 def test_the_drives_temperatures_stand_beside_the_cycles(opened, idle):
@@ -133,21 +150,25 @@ def test_the_drives_temperatures_stand_beside_the_cycles(opened, idle):
     expect(page.locator("#temperatures")).to_have_text(re.compile(r"^macro 2\d\.\d$"))
 
 
-def test_an_operator_homes_moves_jogs_while_held_and_stops(idle, opened):
-    page = armed_page(opened)
+def test_an_operator_homes_moves_jogs_while_held_and_stops(steady, steady_page):
+    page = steady_page(Role.OPERATE)
+    page.click("#take")
+    page.click("#home")
+    expect(page.locator("#command-text")).to_have_text("home: done", timeout=PATIENCE_MS)
+    page.click("#arm")  # homing a stage without a micro ends without power
+    state_is(page, "armed")
     page.fill("#target", "10")
     page.click("#move")
-    idle.until(lambda: abs(idle.plant["macro_position_m"]) > 0.0, "motion")
     expect(page.locator("#command-text")).to_have_text("move: done", timeout=PATIENCE_MS)
     state_is(page, "armed")
-    assert idle.client.status().positions.end_position_m == pytest.approx(0.01, abs=1e-4)
+    assert steady.client.status().positions.end_position_m == pytest.approx(0.01, abs=1e-4)
     press(page, "#jog-right")
     state_is(page, "moving")
     time.sleep(0.5)
     page.mouse.up()
     state_is(page, "armed")  # it holds where it was let go of
-    assert velocity_m_per_s(idle) < REST_M_PER_S
-    assert idle.client.status().positions.end_position_m > 0.0105
+    assert velocity_m_per_s(steady) < REST_M_PER_S
+    assert steady.client.status().positions.end_position_m > 0.0105
     page.click("#stop")
     state_is(page, "idle")
     page.click("#take")  # given back
@@ -189,31 +210,31 @@ def test_a_joint_identified_from_the_page_stands_there_and_says_that_it_is_worn(
     state_is(page, "idle")
 
 
-def test_a_page_that_vanishes_in_the_middle_of_a_jog_stops_the_stage(idle, opened, chromium):
-    page = armed_page(opened)
+def test_a_page_that_vanishes_in_the_middle_of_a_jog_stops_the_stage(steady, steady_page, chromium):
+    page = armed_page(steady_page)
     press(page, "#jog-left")
-    idle.until(lambda: velocity_m_per_s(idle) > REST_M_PER_S, "motion")
+    steady.state_is("moving")
     processes = chromium.new_browser_cdp_session().send("SystemInfo.getProcessInfo")["processInfo"]
     for process in processes:
         if process["type"] == "renderer":
             os.kill(process["id"], signal.SIGKILL)  # no handler of ours runs
-    idle.until(lambda: idle.client.status().state == "armed", "the jog's end")
-    assert idle.client.status().lease is not None
-    idle.state_is("fault")
-    assert idle.client.status().fault.kind == "LEASE"
-    assert velocity_m_per_s(idle) < REST_M_PER_S
+    steady.until(lambda: steady.client.status().state == "armed")
+    assert steady.client.status().lease is not None
+    steady.state_is("fault")
+    assert steady.client.status().fault.kind == "LEASE"
+    assert velocity_m_per_s(steady) < REST_M_PER_S
 
 
-def test_leaving_the_page_gives_the_lease_back(idle, opened):
-    page = armed_page(opened)
+def test_leaving_the_page_gives_the_lease_back(steady, steady_page):
+    page = armed_page(steady_page)
     page.goto("about:blank")
-    idle.state_is("idle")
-    assert idle.client.status().fault is None
-    idle.until(lambda: idle.client.lease_state() is None, "a free lease")
+    steady.state_is("idle")
+    assert steady.client.status().fault is None
+    steady.until(lambda: steady.client.lease_state() is None)
 
 
-def test_stop_is_in_sight_at_phone_width_wherever_one_scrolls(idle, opened):
-    page = armed_page(opened, viewport=PHONE, has_touch=True, is_mobile=True)
+def test_stop_is_in_sight_at_phone_width_wherever_one_scrolls(steady, steady_page):
+    page = armed_page(steady_page, viewport=PHONE, has_touch=True, is_mobile=True)
     assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
     for far in (0.0, 0.5, 1.0):
         page.evaluate("share => scrollTo(0, share * document.body.scrollHeight)", far)

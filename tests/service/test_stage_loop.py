@@ -31,10 +31,10 @@ PATIENCE_S = 60.0
 class Bench:
     """A loop in virtual time, driven step by step, and one operator."""
 
-    def __init__(self, folder, profile="single-axis", backend="batch", remembered=None):
+    def __init__(self, folder, profile="single-axis", backend="batch", remembered=None, clock_s=None):
         self.log = ServiceLog(None)
         self.now_s = 0.0
-        self.desk = Desk(self.log, lambda: self.now_s)
+        self.desk = Desk(self.log, clock_s or (lambda: self.now_s))
         self.figures = Figures()
         self.settings = Settings(profile, backend, folder / "runs", folder / "state")
         remembered = remembered or Remembered()
