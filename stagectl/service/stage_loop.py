@@ -155,7 +155,8 @@ class StageLoop(StageWatch):
         self._settle(order.name)
         backlash = self._kept_backlash(outcome, folder.name) if motion.identifies else None
         if backlash is not None and self._wear is not None:
-            self._wear.found(outcome.backlash, PROBE if order.name == "probe" else IDENTIFIED)
+            source = PROBE if order.name == "probe" else IDENTIFIED
+            self._wear.found(outcome.backlash, source, is_believed=order.name == "home")
         self._finish(order, outcome.text, outcome.stop.name, str(folder), backlash)
         self._log.say("command_done", outcome.text, name=order.name, key=order.key, stop=outcome.stop.name)
 

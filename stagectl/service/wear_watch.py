@@ -84,11 +84,16 @@ class WearWatch:
             self.seen_at = now_text()
         self._tell()
 
-    def found(self, estimate: BacklashEstimate | None, source: str) -> None:
-        """Take what an identification, a homing or a probe found."""
+    def found(self, estimate: BacklashEstimate | None, source: str, is_believed: bool = False) -> None:
+        """Take what an identification, a homing or a probe found.
+
+        `is_believed`: the compensation has it, as after a homing, whose edges are from zeros that it has moved since.
+        """
         if self._tracker is not None and estimate is not None:
             if self._tracker.look(estimate, self._now_s(), source):
                 self.seen_at = now_text()
+            if is_believed:
+                self._tracker.taken()
             self._tell()
 
     def _tell(self) -> None:
