@@ -17,12 +17,13 @@ from stagectl import cli
 from stagectl import stage as stages
 from stagectl.backend import BatchBackend
 from stagectl.client import Client
-from stagectl.profile import PROFILES_FOLDER
+from stagectl.profile import PROFILES_FOLDER, Wear
 from stagectl.record import read_manifest, read_run
 from stagectl.service import messages
 from stagectl.service.daemon import hear_signals
 from stagectl.service.remembered import FILE, recall
 from stagectl.service.stage_world import ENDING
+from stagectl.service.wear_watch import WearWatch
 from stagectl.signals import Stop
 from stagectl.wear import IDENTIFIED
 from tests.service.test_stage_loop import Bench
@@ -188,8 +189,15 @@ def test_the_joint_survives_with_its_date_and_run_and_homing_does_not(tmp_path):
     before_at = datetime.now(UTC)
     bench = connected(tmp_path, "oled-printer")
     assert (bench.status.homed, bench.status.backlash) == (False, None)
+    permitting = bench.loop._stage.profile.model_copy(update={"wear": Wear(compensate=True)})
+    bench.loop._wear = WearWatch(permitting, bench.log, time.monotonic)
     homed = bench.do("home", messages.Home())
     assert homed.stop == "FINISHED"
+    believed = bench.loop._stage.believed_backlash()
+    assert abs(homed.backlash.left_m - believed["left_m"]) > 1e-6  # its edges are from zeros that it has moved since
+    for _ in range(5):
+        bench.loop.step()
+    assert bench.loop._stage.believed_backlash() == believed
     (run,) = bench.settings.runs_root.glob("*-service-home")
     bench.loop.step()
     assert (bench.status.homed, bench.status.backlash) == (True, homed.backlash)

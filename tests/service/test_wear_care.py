@@ -319,7 +319,7 @@ def test_what_nothing_confirms_grows_old_and_less_sure_and_says_so(armed, drift,
 
 
 def test_a_probe_waits_for_the_end_of_a_move_and_goes_by_the_clock(armed):
-    armed.permit(probe_every_s=600.0)
+    armed.permit(probe_every_s=600.0, compensate=True)
     armed.see(worn(armed), 1)
     armed.steps()
     assert armed.probes() == []  # production told of the joint
@@ -341,12 +341,28 @@ def test_a_probe_waits_for_the_end_of_a_move_and_goes_by_the_clock(armed):
     (key,) = armed.probes()
     assert armed.desk.command(key).stop == "FINISHED"
     armed.steps()
-    assert armed.status.wear.width_m == pytest.approx(WIDTH_M, abs=1e-6)
+    found = armed.status.wear
+    assert found.width_m == pytest.approx(WIDTH_M, abs=1e-6)
+    assert believes(armed) == {name: getattr(found, name) for name in JOINT}  # the probe's, by itself
+    assert len(armed.said("backlash_replaced")) == 1
     armed.wear_s += 590.0
     armed.steps()
     assert armed.probes() == [key]
     armed.wear_s += 20.0
     assert armed.loop._wear.probe_due()
+
+
+def probe_begins(bench):
+    """Step until a probe begins, which is stopped at once."""
+    progress = bench.loop._progress
+
+    def enough(what, share):
+        bench.desk.ask_to_stop("seen")
+        progress(what, share)
+
+    bench.stage._progress = enough
+    bench.until(bench.probes)
+    bench.stage._progress = progress
 
 
 @pytest.mark.parametrize("lease", ["none", "over"])
@@ -360,8 +376,7 @@ def test_without_a_lease_nothing_is_touched(armed, lease):
     armed.loop._care_for_joint()
     assert armed.desk.next_order() is None
     armed.desk._lease, armed.now_s = held, began_s
-    armed.loop._care_for_joint()
-    assert armed.desk.next_order().name == "probe"
+    probe_begins(armed)
 
 
 def test_a_probe_that_another_command_came_before_is_due_again_at_once(armed):
@@ -370,15 +385,7 @@ def test_a_probe_that_another_command_came_before_is_due_again_at_once(armed):
     assert armed.desk._current.name == "probe"
     assert armed.do("move", messages.Move(target_m=0.004)).stop == "FINISHED"
     assert armed.probes() == []
-    progress = armed.loop._progress
-
-    def enough(what, share):
-        armed.desk.ask_to_stop("seen")
-        progress(what, share)
-
-    armed.stage._progress = enough
-    armed.until(armed.probes)
-    armed.stage._progress = progress
+    probe_begins(armed)
 
 
 def give_back(bench):
