@@ -184,13 +184,7 @@ class Homing(StreamMotion):
 
         RequestError where it is none.
         """
-        stiffnesses = (estimate.left_stiffness_n_per_m, estimate.right_stiffness_n_per_m)
-        believable = math.isfinite(estimate.centre_m) and 0.0 < estimate.width_m < math.inf
-        if not (believable and all(0.0 < stiffness < math.inf for stiffness in stiffnesses)):
-            raise RequestError(
-                f"backlash of {estimate.width_m:g} m about {estimate.centre_m:g} m with {stiffnesses} N/m: every value "
-                "must be finite, width and stiffness above 0; identify again, touching both edges"
-            )
+        _refuse_no_joint(estimate)
         status = self.status()
         macro_scale, end_scale = self._scales()
         before_m = float(status["end_counts"]) * end_scale - float(status["end_position_m"])
@@ -207,8 +201,9 @@ class Homing(StreamMotion):
     def replace_backlash(self, estimate: BacklashEstimate) -> None:
         """Believe what wear has made of the joint; zeros stay, the stage does not move, the estimator begins anew.
 
-        A recorded event. RequestError while a motion is under way.
+        A recorded event. RequestError where it is none, and while a motion is under way.
         """
+        _refuse_no_joint(estimate)
         status = self.status()
         if status["phase"] != Phase.TRACKING or status["segment_left_rows"] > 0:
             raise RequestError("a backlash is replaced between moves only; wait until the stage holds")
@@ -257,3 +252,13 @@ class Homing(StreamMotion):
     def identify(self, frequency_hz: float | None = None, duration_s: float = 20.0) -> Outcome:
         """Identify the backlash from a sweep over both contacts; without a frequency, one that suits the joint."""
         return self.sweep(IDENTIFY_SHARE, IDENTIFY_HZ, duration_s, "identifying the backlash", frequency_hz)
+
+
+def _refuse_no_joint(estimate: BacklashEstimate) -> None:
+    stiffnesses = (estimate.left_stiffness_n_per_m, estimate.right_stiffness_n_per_m)
+    believable = math.isfinite(estimate.centre_m) and 0.0 < estimate.width_m < math.inf
+    if not (believable and all(0.0 < stiffness < math.inf for stiffness in stiffnesses)):
+        raise RequestError(
+            f"backlash of {estimate.width_m:g} m about {estimate.centre_m:g} m with {stiffnesses} N/m: every value "
+            "must be finite, width and stiffness above 0; identify again, touching both edges"
+        )

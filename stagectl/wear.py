@@ -2,7 +2,8 @@
 
 The estimator of the servo (`stagectl.backlash`) says what contact teaches it since the stage was armed. Here it is
 looked at from time to time: published while both edges were touched lately; else the last value with its age, less and
-less sure, *not observable*. Pure; knows no stage and no clock.
+less sure, *not observable*. What a probe or an identification measured stands until production touches both edges after
+it. Pure; knows no stage and no clock.
 """
 
 import math
@@ -82,7 +83,9 @@ class WearTracker:
         self._alarm = ""
         if last is not None:
             self.go_on_from(last)
-        self._looks: deque[Look] = deque(maxlen=LOOKS_COUNT)
+        self._looks: deque[Look] = deque(maxlen=LOOKS_COUNT)  # of production
+        self._measured: Look | None = None  # until it is taken, or production says something newer
+        self._measured_s = -math.inf
         self._touched_s = [-math.inf, -math.inf]  # left, right
 
     def go_on_from(self, last: Look) -> None:
@@ -105,17 +108,26 @@ class WearTracker:
 
     def observable(self, t_s: float) -> bool:
         """Tell whether both edges were touched lately."""
-        return t_s - min(self._touched_s) <= LATELY_S
+        return t_s - max(self._measured_s, min(self._touched_s)) <= LATELY_S
 
     def look(self, estimate: BacklashEstimate, t_s: float, source: str = PRODUCTION) -> bool:
-        """Take an estimate where it says something and contact lately stands behind it; returns whether it did."""
+        """Take an estimate where it says something and contact lately stands behind it; returns whether it did.
+
+        What was measured has all contact up to then in it: production says something newer by what it touches after.
+        """
         known = estimate.identifiable and all(math.isfinite(getattr(estimate, one.name)) for one in fields(estimate))
-        if not known or estimate.width_m <= 0.0 or (source == PRODUCTION and not self.observable(t_s)):
+        is_news = source != PRODUCTION or (self.observable(t_s) and min(self._touched_s) > self._measured_s)
+        if not known or estimate.width_m <= 0.0 or not is_news:
             self._looks.clear()
             return False
         look = Look(t_s, estimate, source)
         self.go_on_from(look)
-        self._looks.append(look)
+        if source == PRODUCTION:
+            self._measured = None
+            self._looks.append(look)
+        else:
+            self._measured, self._measured_s = look, t_s
+            self._looks.clear()
         return True
 
     def sd_m(self, t_s: float) -> float:
@@ -134,10 +146,11 @@ class WearTracker:
     def believable(self) -> BacklashEstimate | None:
         """Return what may be believed from now on: sure, steady over `LOOKS_COUNT` looks, within the limits; or None.
 
-        The value is the looks' median.
+        The value is the looks' median. What was measured is fitted over many touches: it counts by itself.
         """
-        looks, limits = [one.estimate for one in self._looks], self._limits
-        if len(looks) < LOOKS_COUNT or any(width_sd_m(one) > limits.trusted_sd_m for one in looks):
+        looks, limits = [one.estimate for one in ([self._measured] if self._measured else self._looks)], self._limits
+        enough = self._measured is not None or len(looks) == LOOKS_COUNT
+        if not enough or any(width_sd_m(one) > limits.trusted_sd_m for one in looks):
             return None
         for name in ("left_m", "right_m"):
             values = [getattr(one, name) for one in looks]
@@ -150,6 +163,7 @@ class WearTracker:
     def taken(self) -> None:
         """A value was taken into the compensation: what follows must agree anew."""
         self._looks.clear()
+        self._measured = None
 
 
 def _median(looks: Sequence[BacklashEstimate]) -> BacklashEstimate:

@@ -48,6 +48,23 @@ def test_a_probe_and_an_identification_need_no_other_contact():
         assert tracker.newest.source == source
 
 
+@pytest.mark.parametrize("source", [PROBE, IDENTIFIED])
+def test_what_was_measured_stands_until_production_touches_both_edges_after_it(source):
+    tracker, later = WearTracker(LIMITS), replace(GOOD, left_m=300e-6)
+    tracker.touched(100.0, left=True, right=True)  # what measured it
+    assert tracker.look(GOOD, 100.0, source)
+    for t_s in (100.5, 102.0):
+        assert not tracker.look(later, t_s)
+        assert tracker.newest == Look(100.0, GOOD, source)
+    assert tracker.observable(109.0)
+    assert not tracker.observable(111.0)
+    tracker.touched(112.0, left=True, right=False)
+    assert not tracker.look(later, 112.0)
+    tracker.touched(113.0, left=False, right=True)
+    assert tracker.look(later, 113.0)
+    assert tracker.newest == Look(113.0, later, "production")
+
+
 @pytest.mark.parametrize("change", [{"left_sd_m": math.inf}, {"left_m": math.nan}, {"left_m": -1e-3}])
 def test_what_says_nothing_is_not_published(change):
     tracker = looked(WearTracker(LIMITS), GOOD)
@@ -102,6 +119,30 @@ def test_only_what_is_steady_is_believed_and_it_is_the_median():
     assert found.left_m == pytest.approx(240e-6 + 1e-8)
     assert found.right_m == 242e-6
     tracker.taken()
+    assert tracker.believable() is None
+
+
+@pytest.mark.parametrize("source", [PROBE, IDENTIFIED])
+def test_what_was_measured_is_believed_by_itself_until_it_is_taken(source):
+    before = replace(GOOD, left_m=241e-6)
+    tracker = looked(WearTracker(LIMITS), *[before] * LOOKS_COUNT)
+    assert tracker.look(GOOD, 120.0, source)
+    assert not tracker.look(before, 130.0)  # production has nothing newer
+    assert tracker.believable() == GOOD
+    tracker.taken()
+    assert tracker.believable() is None
+    assert tracker.look(GOOD, 140.0, source)
+    looked(tracker, *[before] * (LOOKS_COUNT - 1), from_s=150.0)
+    assert tracker.believable() is None  # production speaks again, and must be steady
+    assert looked(tracker, before, from_s=170.0).believable() == before
+
+
+@pytest.mark.parametrize(
+    "change", [{"left_sd_m": 0.6e-6}, {"left_m": 260e-6}, {"left_stiffness_n_per_m": 9e3}], ids=str
+)
+def test_what_was_measured_is_believed_only_where_it_is_sure_and_within_the_limits(change):
+    tracker = WearTracker(LIMITS)
+    assert tracker.look(replace(GOOD, **change), 100.0, PROBE)
     assert tracker.believable() is None
 
 

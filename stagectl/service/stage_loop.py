@@ -147,13 +147,16 @@ class StageLoop(StageWatch):
         self._enter(motion.event, order.name)
         if not motion.needs_homing:
             self._homed = False
+        if order.name == "probe" and self._wear is not None:
+            self._wear.probe_begun()  # one that another command came before is due again when the stage holds
         outcome = motion.work(stage, order)
         if not motion.needs_homing:
             self._homed = outcome.finished
         self._settle(order.name)
         backlash = self._kept_backlash(outcome, folder.name) if motion.identifies else None
         if backlash is not None and self._wear is not None:
-            self._wear.found(outcome.backlash, PROBE if order.name == "probe" else IDENTIFIED)
+            source = PROBE if order.name == "probe" else IDENTIFIED
+            self._wear.found(outcome.backlash, source, is_believed=order.name == "home")
         self._finish(order, outcome.text, outcome.stop.name, str(folder), backlash)
         self._log.say("command_done", outcome.text, name=order.name, key=order.key, stop=outcome.stop.name)
 

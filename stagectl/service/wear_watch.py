@@ -84,11 +84,16 @@ class WearWatch:
             self.seen_at = now_text()
         self._tell()
 
-    def found(self, estimate: BacklashEstimate | None, source: str) -> None:
-        """Take what an identification, a homing or a probe found."""
+    def found(self, estimate: BacklashEstimate | None, source: str, is_believed: bool = False) -> None:
+        """Take what an identification, a homing or a probe found.
+
+        `is_believed`: the compensation has it, as after a homing, whose edges are from zeros that it has moved since.
+        """
         if self._tracker is not None and estimate is not None:
             if self._tracker.look(estimate, self._now_s(), source):
                 self.seen_at = now_text()
+            if is_believed:
+                self._tracker.taken()
             self._tell()
 
     def _tell(self) -> None:
@@ -120,16 +125,17 @@ class WearWatch:
             self._log.say("backlash_replaced", f"the compensation believes {estimate.width_m * 1e6:.2f} um from now on")
 
     def probe_due(self) -> bool:
-        """Tell whether the profile wants both edges touched now; says yes once in `wear.probe_every_s`."""
+        """Tell whether the profile wants both edges touched now, `wear.probe_every_s` after it was known last."""
         every_s, now_s = self._profile.wear.probe_every_s, self._now_s()
         if self._tracker is None or every_s is None:
             return False
         newest = self._tracker.newest
         known_s = max(self._probed_s, -math.inf if newest is None else newest.t_s)
-        if now_s - known_s < every_s:
-            return False
-        self._probed_s = now_s
-        return True
+        return now_s - known_s >= every_s
+
+    def probe_begun(self) -> None:
+        """A probe begins; whatever becomes of it, the next is not due before `wear.probe_every_s`."""
+        self._probed_s = self._now_s()
 
     def message(self) -> messages.Wear | None:
         """Say what is known of the joint now; None where nothing ever was."""

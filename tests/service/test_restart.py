@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +17,13 @@ from stagectl import cli
 from stagectl import stage as stages
 from stagectl.backend import BatchBackend
 from stagectl.client import Client
-from stagectl.profile import PROFILES_FOLDER
+from stagectl.profile import PROFILES_FOLDER, Wear
 from stagectl.record import read_manifest, read_run
 from stagectl.service import messages
 from stagectl.service.daemon import hear_signals
 from stagectl.service.remembered import FILE, recall
 from stagectl.service.stage_world import ENDING
+from stagectl.service.wear_watch import WearWatch
 from stagectl.signals import Stop
 from stagectl.wear import IDENTIFIED
 from tests.service.test_stage_loop import Bench
@@ -60,9 +62,11 @@ def end(bench):
     bench.loop.run()
 
 
-def newest_manifest(bench, name):
-    """The manifest of the newest run of that name."""
-    return read_manifest(max(bench.settings.runs_root.glob(f"*-service-{name}"), key=os.path.getmtime))
+def homes(bench):
+    """Home it; returns the manifest of that run."""
+    homed = bench.do("home", messages.Home())
+    assert homed.stop == "FINISHED"
+    return read_manifest(Path(homed.run))
 
 
 @pytest.fixture
@@ -96,7 +100,8 @@ def test_an_edited_profile_waits_until_the_stage_has_no_power(tmp_path, mine, ow
     os.kill(os.getpid(), signal.SIGHUP)
     for _ in range(3):
         bench.loop.step()
-    assert bench.do("move", messages.Move(target_m=0.004)).stop == "FINISHED"
+    moved = bench.do("move", messages.Move(target_m=0.004))
+    assert moved.stop == "FINISHED"
     assert (bench.status.state, bench.status.homed) == ("armed", True)
     assert bench.status.limits.velocity_m_per_s == LIMIT_M_PER_S
     if goes_by == "a stop":
@@ -113,9 +118,8 @@ def test_an_edited_profile_waits_until_the_stage_has_no_power(tmp_path, mine, ow
     assert bench.status.limits.velocity_m_per_s == EDITED_M_PER_S
     assert bench.desk.profile.macro.velocity_limit_m_per_s == EDITED_M_PER_S
     assert not bench.status.homed
-    assert newest_manifest(bench, "arm")["profile"]["macro"]["velocity_limit_m_per_s"] == LIMIT_M_PER_S
-    assert bench.do("home", messages.Home()).stop == "FINISHED"
-    assert newest_manifest(bench, "home")["profile"]["macro"]["velocity_limit_m_per_s"] == EDITED_M_PER_S
+    assert read_manifest(Path(moved.run))["profile"]["macro"]["velocity_limit_m_per_s"] == LIMIT_M_PER_S
+    assert homes(bench)["profile"]["macro"]["velocity_limit_m_per_s"] == EDITED_M_PER_S
     again = [entry for entry in bench.log.last(200) if entry.event == "profile"]
     assert [(entry.text, entry.fields["profile"]) for entry in again] == [("read again", str(mine))]
     end(bench)
@@ -185,8 +189,15 @@ def test_the_joint_survives_with_its_date_and_run_and_homing_does_not(tmp_path):
     before_at = datetime.now(UTC)
     bench = connected(tmp_path, "oled-printer")
     assert (bench.status.homed, bench.status.backlash) == (False, None)
+    permitting = bench.loop._stage.profile.model_copy(update={"wear": Wear(compensate=True)})
+    bench.loop._wear = WearWatch(permitting, bench.log, time.monotonic)
     homed = bench.do("home", messages.Home())
     assert homed.stop == "FINISHED"
+    believed = bench.loop._stage.believed_backlash()
+    assert abs(homed.backlash.left_m - believed["left_m"]) > 1e-6  # its edges are from zeros that it has moved since
+    for _ in range(5):
+        bench.loop.step()
+    assert bench.loop._stage.believed_backlash() == believed
     (run,) = bench.settings.runs_root.glob("*-service-home")
     bench.loop.step()
     assert (bench.status.homed, bench.status.backlash) == (True, homed.backlash)
@@ -231,8 +242,7 @@ def rig_here(monkeypatch):
 
 def asked_and_chosen(bench):
     """What the status and the manifests of a motion say of the world: asked for, chosen, banner."""
-    assert bench.do("home", messages.Home()).stop == "FINISHED"
-    found = newest_manifest(bench, "home")
+    found = homes(bench)
     session = read_manifest(bench.settings.runs_root / found["session"])
     facts = [(one["backend_asked"], one["backend"], one["banner"]) for one in (found, session)]
     assert facts[0] == facts[1]

@@ -12,7 +12,8 @@ from stagectl.service import messages
 from stagectl.service.desk import Desk
 from stagectl.service.service_log import ServiceLog
 from stagectl.service.states import State
-from stagectl.wear import PROBE
+from stagectl.service.wear_watch import WearWatch
+from stagectl.wear import LATELY_S, PROBE
 from tests.service.served import Served
 from tests.toml_text import changed
 
@@ -35,6 +36,10 @@ class Probed(Served):
         machine.write_text(changed(MACHINES_FOLDER / "oled-printer.toml", WORN))
         super().__init__(folder, profile, machine)
 
+    def now_s(self):
+        """The rig's own time."""
+        return self.stage.link.now_t_ns() * 1e-9
+
 
 @pytest.fixture(scope="module")
 def permitting(tmp_path_factory):
@@ -48,8 +53,7 @@ def probed(permitting, monkeypatch):
     """A service at rest, that wants to touch the joint by itself as soon as it is armed."""
     permitting.recovers()
     monkeypatch.setenv("STAGECTL_SOCKET", str(permitting.socket))
-    permitting.bench.loop._wear._probed_s = -np.inf
-    permitting.bench.loop._wear._tracker.newest = None
+    permitting.bench.loop._wear = WearWatch(permitting.stage.profile, permitting.log, permitting.now_s)
     yield permitting
     permitting.recovers()
 
@@ -100,6 +104,11 @@ def test_a_probe_finds_both_edges_presses_softly_and_comes_back(probed):
     assert (wear.source, wear.observable) == (PROBE, True)
     assert wear.width_m == asked.backlash.width_m
     assert client.status().backlash == asked.backlash
+    ended_s = probed.now_s() - wear.age_s
+    for after_s, observable in ((0.3 * LATELY_S, True), (LATELY_S, False)):  # it holds, with the estimator at work
+        probed.until(lambda until_s=ended_s + after_s + 1.5: probed.now_s() > until_s)
+        held = client.status().wear
+        assert (held.source, held.observable, held.width_m) == (PROBE, observable, wear.width_m)
     client.give_lease_back()
     probed.state_is("idle")
     assert read_manifest(probed.bench.settings.runs_root / asked.run)["record"]["state"] == "closed"

@@ -126,11 +126,29 @@ def test_only_a_permitted_sure_and_new_value_is_a_replacement(oled_profile):
     assert one.watch.message().believed_since
 
 
+@pytest.mark.parametrize(
+    ("is_believed", "sd_m", "is_due"), [(False, 1e-7, True), (True, 1e-7, False), (False, 1e-6, False)]
+)
+def test_what_was_measured_is_a_replacement_by_itself_unless_it_is_believed_already(
+    oled_profile, is_believed, sd_m, is_due
+):
+    one = Watched(oled_profile, compensate=True)
+    believed = {name: getattr(joint(oled_profile), name) for name in JOINT}
+    found = joint(oled_profile, left_m=oled_profile.backlash.left_m + 4e-6, left_sd_m=sd_m)
+    one.watch.found(found, IDENTIFIED, is_believed=is_believed)
+    for _ in range(3):
+        one.work(found)  # nothing is pressed
+    assert one.watch.replacement(believed) == (found if is_due else None)
+    assert one.watch.message().width_m == found.width_m
+
+
 def test_a_probe_is_due_where_it_is_permitted_and_nothing_else_told_of_the_joint(oled_profile):
     assert not Watched(oled_profile).watch.probe_due()
     one = Watched(oled_profile, probe_every_s=60.0)
     assert one.watch.probe_due()
-    assert not one.watch.probe_due()  # once, whatever became of it
+    assert one.watch.probe_due()  # until one begins, whatever becomes of that
+    one.watch.probe_begun()
+    assert not one.watch.probe_due()
     one.now_s += 61.0
     one.work(joint(oled_profile), 3.0, -3.0)
     assert not one.watch.probe_due()
