@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench import service, service_batch, service_processes
-from bench.journal import Journal, cached
+from bench.journal import Journal, beside_figures, sources_hash
 from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
 from tests.faults import losses, real
@@ -60,14 +60,17 @@ def test_one_bad_run_is_a_missed_bar_and_says_how_to_see_it_again():
     assert (lost[f"batch: {LOST}"].value, lost[f"batch: {LOST}"].holds) == (3.0, False)
 
 
-def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    Journal(cached("test")).keep(4, {"line": "four"})
-    (path,) = (tmp_path / "stagectl-bench").glob("test-*.jsonl")
+def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path):
+    path = tmp_path / "journals" / "test.jsonl"
+    Journal(path).keep(4, {"line": "four"})
     path.write_text(path.read_text() + '{"seed": 5, "li')  # killed in the middle of a line
-    Journal(cached("test")).keep(6, {"line": "six"})
-    assert Journal(cached("test")).entries == {4: {"line": "four"}, 6: {"line": "six"}}
+    Journal(path).keep(6, {"line": "six"})
+    assert Journal(path).entries == {4: {"line": "four"}, 6: {"line": "six"}}
     assert Journal(None).entries == {}
+
+
+def test_a_campaigns_journal_is_of_its_sources():
+    assert beside_figures("test") == ROOT / "docs" / "journals" / f"test-{sources_hash()}.jsonl"
 
 
 def test_a_seed_with_real_processes_is_the_same_run_again_and_all_of_them_are_drawn():
