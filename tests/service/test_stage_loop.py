@@ -9,7 +9,8 @@ from sim_backend.faults import Fault
 from stagectl.errors import JogOver, RequestError
 from stagectl.outcome import BacklashEstimate
 from stagectl.profile import PROFILES_FOLDER
-from stagectl.requests import Mode
+from stagectl.requests import Mode, Phase
+from stagectl.row import new_rows
 from stagectl.service import messages
 from stagectl.service.desk import Busy, Desk, Ending, Order, Unfit
 from stagectl.service.exposition import Figures
@@ -20,7 +21,6 @@ from stagectl.service.service_log import ServiceLog
 from stagectl.service.stage_loop import StageLoop
 from stagectl.service.stage_state import Settings
 from stagectl.signals import Stop
-from stagectl.wear import PRODUCTION
 from tests.toml_text import changed
 
 pytestmark = pytest.mark.real_time
@@ -511,8 +511,14 @@ def test_the_joint_of_one_world_is_not_shown_in_another_and_keeps_the_date_it_wa
             sides = {f"{side}_{what}": 1e-7 for side in ("left", "right") for what in ("sd_m", "stiffness_sd_n_per_m")}
             values = {"left_m": value_m, "right_m": value_m} | sides
             stiff = {"left_stiffness_n_per_m": 1e4, "right_stiffness_n_per_m": 1e4}
-            bench.loop._wear.found(BacklashEstimate(**values, **stiff), PRODUCTION)
-            seen_at = bench.loop._wear.seen_at
+            rows = new_rows(2)
+            rows["run_phase"], rows["contact_force_estimate_n"] = int(Phase.TRACKING), (3.0, -3.0)
+            wear = bench.loop._wear
+            later_s = wear._now_s() + 60.0
+            wear._now_s = lambda later_s=later_s: later_s  # after the homing's touches
+            wear.observe(rows)
+            wear.look(BacklashEstimate(**values, **stiff))
+            seen_at = wear.seen_at
         time.sleep(0.002)  # dates are in milliseconds
         bench.desk.ask_to_stop("enough")
         bench.until(lambda: bench.status.state == "idle")
