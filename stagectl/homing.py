@@ -7,11 +7,11 @@ import numpy as np
 from drivers import cia402
 from stagectl import trajectory as trajectories
 from stagectl.backlash import HOLD_RATIO, filter_time_s
-from stagectl.errors import DriveError, RequestError
+from stagectl.errors import DriveError, LinkError, RequestError
 from stagectl.outcome import BacklashEstimate, Outcome
 from stagectl.requests import Mode, Phase
 from stagectl.session import WATCHED_ONLY
-from stagectl.signals import Stop
+from stagectl.signals import Stop, stop_sentence
 from stagectl.stream_motion import StreamMotion
 from stagectl.touch_sweep import (
     IDENTIFY_HZ,
@@ -82,6 +82,8 @@ class Homing(StreamMotion):
         while status["phase"] != Phase.STOPPED:
             self.pump(_STANDSTILL_WINDOW_S)
             status = self._await_sensor()
+            if status["phase"] != Phase.HOMED_DRIVE:  # something stops it: why is known when it is over
+                continue
             rows = self.link.rows.read_last(window_rows)
             # From the least to the greatest: where a swing turns round, it is as far after a while as before.
             macro_m, end_m = (float(np.ptp(rows[f"{axis}_position_m"])) for axis in ("macro", "end"))
@@ -157,6 +159,8 @@ class Homing(StreamMotion):
         step_m = self.profile.macro.encoder_step_m
         self.disarm()
         self._demand_agreed()
+        if self._heartbeats.missing:
+            return Stop.HEARTBEAT_LOST
         master = self.master
         self._write_mode("macro", cia402.MODE_HOMING)
         master.write(node, cia402.HOMING_METHOD, 0, method)
@@ -167,17 +171,26 @@ class Homing(StreamMotion):
         if self._stopped_meanwhile("homing the macro"):
             return Stop.OPERATOR
         self._holds_lease = True
+        self._reason = ""
         self.pump()
-        self._request(mode=int(Mode.HOME_DRIVE))
+        self._request(mode=int(Mode.HOME_DRIVE), stop=int(Stop.NONE))
         self.pump()
         status = self._wait(lambda s: s["phase"] == Phase.HOMED_DRIVE, homing.timeout_s, "homing the macro")
         return Stop(int(status["stop"]))
 
     def _leave_homing(self) -> None:
-        """Wait until the macro's drive has let go; enabling gives it back the mode that the servo works in."""
+        """Wait until the macro's drive has let go; enabling gives it back the mode that the servo works in.
+
+        LinkError where a drive is not heard of any more.
+        """
+        off = cia402.State.SWITCH_ON_DISABLED
         self._wait(
-            lambda s: cia402.state_of(int(s["macro_statusword"])) is cia402.State.SWITCH_ON_DISABLED, 5.0, "resting"
+            lambda s: bool(self._heartbeats.missing) or cia402.state_of(int(s["macro_statusword"])) is off,
+            5.0,
+            "resting",
         )
+        if self._heartbeats.missing:
+            raise LinkError(f"homing: {stop_sentence(Stop.HEARTBEAT_LOST, self._heartbeats.detail(self._node_ids))}")
 
     def take_backlash(self, estimate: BacklashEstimate) -> None:
         """Believe an identified backlash; the end's zero moves so that the gap's centre is where the profile has it.

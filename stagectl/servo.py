@@ -377,6 +377,10 @@ class Servo:
             self._rests_from_t_ns = t_ns + round(1e9 * ramp_s)
         self._enter(phase, t_ns)
 
+    def _asked_stop(self) -> Stop:
+        """Return why the supervisor wants the stage at rest."""
+        return Stop(self._asked.stop) or Stop.OPERATOR
+
     def _refusal(self, mode: Mode) -> tuple[Stop, str]:
         """Return why the drives must not be powered now, (NONE, "") when they may."""
         seen = self._seen
@@ -411,14 +415,14 @@ class Servo:
                     self._enter(Phase.ENABLING if mode is Mode.TRACK else Phase.HOMING_DRIVE, t_ns)
             elif mode is Mode.IDLE:
                 self._enter(Phase.IDLE, t_ns)
-            elif self.phase is Phase.HOMED_DRIVE and mode is Mode.HOME_DRIVE:
+            elif self.phase is Phase.HOMED_DRIVE and mode in (Mode.HOME_DRIVE, Mode.STOP):
                 return self._homing(mode, macro_state, silent, t_ns)
             return off, off
         if self.phase is Phase.HOMING_DRIVE:
             return self._homing(mode, macro_state, silent, t_ns)
         if self.phase is Phase.ENABLING:
             if silent or mode is not Mode.TRACK:
-                self._end(Stop.SUPERVISOR_SILENT if silent else Stop.OPERATOR, Phase.STOPPED, t_ns)
+                self._end(Stop.SUPERVISOR_SILENT if silent else self._asked_stop(), Phase.STOPPED, t_ns)
                 return off, off
             stop, text = self._refusal(mode)
             if stop is not Stop.NONE:
@@ -443,7 +447,7 @@ class Servo:
                 text = f"no sign of life for {silence_s:.3f} s, limit {self._silence_ns * 1e-9:g} s"
                 self._end(Stop.SUPERVISOR_SILENT, Phase.STOPPING, t_ns, text)
             elif mode is not Mode.TRACK:
-                self._end(Stop(self._asked.stop) or Stop.OPERATOR, Phase.STOPPING, t_ns)
+                self._end(self._asked_stop(), Phase.STOPPING, t_ns)
             elif seen.lease_left_ns <= 0:
                 text = f"it ended {-seen.lease_left_ns * 1e-6:.1f} ms ago; renew it as long as the stage moves"
                 self._end(Stop.LEASE, Phase.STOPPING, t_ns, text)
@@ -461,7 +465,8 @@ class Servo:
             if self._stands(t_ns):
                 self._enter(Phase.STOPPED, t_ns)
             elif in_phase_s > _QUICK_STOP_TIMEOUT_S:
-                self.text += f"; the macro was not seen to stand within {_QUICK_STOP_TIMEOUT_S:g} s: keep clear of it"
+                unseen = f"the macro was not seen to stand within {_QUICK_STOP_TIMEOUT_S:g} s: keep clear of it"
+                self.text = f"{self.text}; {unseen}" if self.text else unseen
                 self._enter(Phase.STOPPED, t_ns)
             return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
         # STOPPED: hold what the drives hold until the fault is acknowledged
@@ -534,7 +539,7 @@ class Servo:
         off, on = cia402.State.SWITCH_ON_DISABLED, cia402.State.OPERATION_ENABLED
         seen = self._seen
         if silent or mode is not Mode.HOME_DRIVE or seen.lease_left_ns <= 0:
-            given_up = Stop.OPERATOR if mode is not Mode.HOME_DRIVE else Stop.LEASE
+            given_up = self._asked_stop() if mode is not Mode.HOME_DRIVE else Stop.LEASE
             self._end(Stop.SUPERVISOR_SILENT if silent else given_up, Phase.QUICK_STOP, t_ns)
             return cia402.State.QUICK_STOP_ACTIVE, off
         stop, text = self._refusal(mode)

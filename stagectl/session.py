@@ -41,6 +41,7 @@ _NEWS_KEPT_COUNT = 100
 _STALL_S = 1.5  # without a cycle: three times what the servo grants this side
 _FAULTS = (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE)
 
+_NOTHING_TO_STOP = (Phase.IDLE, Phase.STOPPED)  # a drive that holds after its homing has power still
 _WITH_POWER = (int(Mode.TRACK), int(Mode.HOME_DRIVE))
 WATCHED_ONLY = (
     "real drives on a simulated interferometer may only be watched: what moves is not what is measured; connect the "
@@ -91,7 +92,7 @@ class Session:
         tables = {axis: table for axis, table in axes if table is not None}
         self._temperatures = Temperatures(tables, self._temperature_count)
         self._news: deque[News] = deque(maxlen=_NEWS_KEPT_COUNT)
-        self._reason = ""  # why this side asked the servo to stop
+        self._reason, self._reason_stop = "", Stop.NONE  # why this side asked the servo to stop, and as what
         self._trouble: StagectlError | None = None  # raised as soon as the stage rests
         self.mappings: dict[str, DriveMapping] = {}
         self._modes: dict[AxisName, int] = {}
@@ -145,10 +146,15 @@ class Session:
         status = self.status()
         if status["stop"] == Stop.NONE:
             return ""
-        return status["text"].tobytes().rstrip(b"\0").decode(errors="replace") or self._reason
+        text = status["text"].tobytes().rstrip(b"\0").decode(errors="replace")
+        if self._reason and text and status["stop"] == self._reason_stop:
+            return f"{self._reason}; {text}"
+        return text or self._reason
 
     def _outcome(self, name: str, stop: Stop, first_row: int, backlash: BacklashEstimate | None = None) -> Outcome:
         detail = "" if stop is Stop.FINISHED else self.detail
+        if stop is Stop.HEARTBEAT_LOST and not detail:  # refused: the servo did not even hear of it
+            detail = self._heartbeats.detail(self._node_ids)
         return Outcome(name, stop, first_row, self.recorder.rows_count - first_row, backlash, detail)
 
     # ---- time ------------------------------------------------------------------------------------------------
@@ -192,8 +198,8 @@ class Session:
         """Have the servo bring the stage to rest under its law; `trouble` is raised when it has."""
         if trouble is not None and self._trouble is None:
             self._trouble = trouble
-        if self.status()["phase"] not in RESTING and not self._reason:
-            self._reason = reason
+        if self.status()["phase"] not in _NOTHING_TO_STOP and not self._reason:
+            self._reason, self._reason_stop = reason, stop
             self._event("distress", stop=stop.name, text=reason)
             self._request(mode=int(Mode.STOP), stop=int(stop))
 
@@ -433,8 +439,6 @@ class Session:
         """Enable like `enable`; FINISHED where the stage holds, else why it doesn't."""
         first_row = self.recorder.rows_count
         stop = self.enable(law)
-        if stop is Stop.HEARTBEAT_LOST:  # refused: the servo did not even hear of it
-            return Outcome("enable", stop, first_row, 0, detail=self._heartbeats.detail(self._node_ids))
         return self._outcome("enable", Stop.FINISHED if stop is Stop.NONE else stop, first_row)
 
     def ask_to_stop(self) -> None:

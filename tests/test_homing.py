@@ -7,6 +7,7 @@ from drivers import cia402
 from sim_backend.faults import Fault
 from sim_backend.machine import load_machine
 from stagectl.backend import BatchBackend
+from stagectl.errors import LinkError
 from stagectl.profile import load_profile
 from stagectl.record import read_run
 from stagectl.requests import Phase
@@ -91,3 +92,40 @@ def test_a_drive_that_lets_go_after_its_homing_gets_no_power_again(cause, tmp_pa
     assert not powered[held[-1] + 5 :].any()
     assert not rows["homing_id"].any()
     assert np.ptp(rows["macro_encoder_m"][held[0] :]) < 0.5e-3  # it stays there, and is not sent off again
+
+
+def dark_at(there, tmp_path, profile, machine):
+    """A stage whose macro's drive loses its power for good as soon as `there` holds of the newest rows."""
+    backend = BatchBackend(machine, seed=1)
+    struck = False
+
+    def strike(rows):
+        nonlocal struck
+        if not struck and there(rows):
+            struck = True
+            backend.rig.inject(Fault("power_loss", node_id=MACRO, duration_s=1e3), backend.wire.t_ns)
+
+    return Supervisor(profile, backend, tmp_path / "run", observe=strike)
+
+
+@pytest.mark.parametrize("phase", [Phase.HOMING_DRIVE, Phase.HOMED_DRIVE])
+def test_a_drive_that_goes_dark_in_its_homing_is_named(phase, tmp_path, single_profile, single_machine):
+    """It was told as a stop that the operator had asked for, or as a macro that does not hold still."""
+    machine = on_a_slope(single_machine)
+    with dark_at(lambda rows: phase in rows["run_phase"], tmp_path, single_profile, machine) as stage:
+        outcome = stage.home()
+        with pytest.raises(LinkError, match=rf"node {MACRO}.*check the drive's power"):
+            stage.home()
+    assert outcome.stop is Stop.HEARTBEAT_LOST
+    assert outcome.detail.startswith(f"the last of macro (node {MACRO}): ")
+    assert "limit 200 ms" in outcome.detail
+    assert outcome.detail.endswith("; the macro was not seen to stand within 5 s: keep clear of it")
+    assert not read_run(tmp_path / "run").rows["homing_id"].any()
+
+
+def test_a_drive_that_goes_dark_as_it_lets_go_is_named(tmp_path, single_profile, single_machine):
+    """It was a wait of 5 s that had not ended: for a statusword that nobody sent any more."""
+    with dark_at(lambda rows: rows["homing_id"].any(), tmp_path, single_profile, single_machine) as stage:
+        with pytest.raises(LinkError, match=rf"^homing: .*heartbeat: the last of macro \(node {MACRO}\): "):
+            stage.home()
+        assert not stage.status()["stop"]
