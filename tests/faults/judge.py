@@ -244,8 +244,9 @@ def _rest(seen: dict[str, Any], at: int, end: int, noticed_t_ns: int | None) -> 
     starts = np.flatnonzero(states != ENABLED)[:1].tolist()
     if noticed_t_ns is not None:
         starts.append(max(0, int(np.searchsorted(seen["t_ns"], noticed_t_ns)) - at))
-    if not starts:
-        return None
+    if not starts:  # the rig was gone before anything was done: all that was seen of it must be a standstill
+        stood = velocity.size >= REST_SAMPLES and bool((np.abs(velocity) < REST_M_PER_S).all())
+        return at if stood else None
     first = min(starts)
     slow = np.concatenate([[0], np.cumsum(np.abs(velocity[first:]) < REST_M_PER_S)])
     found = np.flatnonzero(slow[REST_SAMPLES:] - slow[:-REST_SAMPLES] == REST_SAMPLES)[:1].tolist()

@@ -114,6 +114,21 @@ def test_judges_see_a_stage_that_moves_again():
     assert bars_missed(facts, record) == {STANDSTILL}
 
 
+def test_a_macro_that_stood_all_the_time_that_was_seen_of_it_stood_still():
+    """A fault of the service itself, which closes that world, and the rig with it, before the servo hears of it."""
+    facts, record = rest_after(2.0)
+    facts.judged_until_t_ns = 1_015_000_000
+    facts.seen["macro_velocity_m_per_s"][:] = 0.0
+    facts.seen["macro_position_m"][:] = 0.2
+    assert bars_missed(facts, record) == {STANDSTILL}  # 15 ms are no standstill
+    facts.judged_until_t_ns = 1_220_000_000
+    record.columns["stop"][:], record.columns["run_phase"][:] = 0, 3
+    facts.seen["states"][:] = ENABLED
+    assert bars_missed(facts, record) == set()
+    facts.seen["macro_velocity_m_per_s"][1100] = 2e-3
+    assert bars_missed(facts, record) == {STANDSTILL}
+
+
 def test_judges_see_an_axis_that_is_let_go_of_before_it_rests():
     facts, record = rest_after(2.0)
     velocity = facts.seen["macro_velocity_m_per_s"]
