@@ -31,8 +31,14 @@ _QUICK_STOP_TIMEOUT_S = 5.0
 _HEARTBEATS_PER_TIMEOUT = 4
 _REST_M_PER_S = 1e-3
 _REST_WINDOW_NS = 50_000_000
+_STILL_WINDOWS = 2
+_LEAST_STOPPING_S = 0.3
+_SETTLING_NS = 100_000_000
+"""From the reference's rest until power goes: cut in its last cycle, the force that braked the macro threw it back."""
 _INTERLOCKS = SAFE_TORQUE_OFF | PRESSURE_LOW
 _LIMIT_SWITCHES = NEGATIVE_LIMIT | POSITIVE_LIMIT
+_RELATIVE_KEPT_RATIO = 0.9  # of the relative speed, from cycle to cycle of a stop
+_RELATIVE_REST_M_PER_S = 1e-6
 _READY_SAMPLES = 200  # before the sample clock counts as locked: 60 us / 200 = 0.3 us
 
 _GUIDED_STOPS = (
@@ -174,6 +180,7 @@ class Servo:
         self._deadline_t_ns = 0
         self._rest_mark_t_ns = 0
         self._rest_mark_m = 0.0
+        self._still_windows_count = 0
         self._rests_from_t_ns = 0  # before that no ramp can have brought it to rest
 
     @property
@@ -369,7 +376,7 @@ class Servo:
             self.stop, self.text = stop, text
         elif phase is Phase.QUICK_STOP and text and text not in self.text:
             self.text = f"{self.text}; then {text}"
-        self._rest_mark_t_ns, self._rest_mark_m = t_ns, float("nan")
+        self._look_for_rest(t_ns)
         if self.phase in (Phase.TRACKING, Phase.STOPPING):
             guard = self.tracker.active.guard
             speed, limit = abs(float(guard["macro_velocity_m_per_s"][0])), float(guard["velocity_limit_m_per_s"][0])
@@ -455,7 +462,9 @@ class Servo:
             return on, on
         if self.phase is Phase.STOPPING:
             self._need_no_lease()
-            if self.tracker.hold["velocity_m_per_s"][0] == 0.0 and in_phase_s > 0.3:
+            if self.tracker.hold["velocity_m_per_s"][0] != 0.0:
+                self._rest_mark_t_ns = t_ns
+            if t_ns - self._rest_mark_t_ns > _SETTLING_NS and in_phase_s > _LEAST_STOPPING_S:
                 self._enter(Phase.STOPPED, t_ns)
                 return self._stopped_targets(mode)
             return on, on
@@ -510,10 +519,16 @@ class Servo:
             return Stop.SENSOR_AGE, text
         return Stop.DRIVE_FAULT, self._detail(Stop.DRIVE_FAULT)
 
+    def _look_for_rest(self, t_ns: int) -> None:
+        """Look from here on whether the macro's encoder stands."""
+        self._rest_mark_t_ns, self._rest_mark_m = t_ns, float("nan")
+        self._still_windows_count = 0
+
     def _stands(self, t_ns: int) -> bool:
         """Tell whether the macro's own encoder has been still for a while, no sooner than its ramp can end.
 
-        A position that is stuck, or no position at all in a mapping that another master changed, is still too.
+        One window is not enough: a macro that swings has turned round within it. A position that is stuck, or no
+        position at all in a mapping that another master changed, is still too.
         """
         seen = self._seen
         if t_ns < self._rests_from_t_ns:
@@ -523,13 +538,14 @@ class Servo:
         encoder_m, since_s = seen.macro_encoder_m, (t_ns - self._rest_mark_t_ns) * 1e-9
         moved_m = abs(encoder_m - self._rest_mark_m)
         self._rest_mark_t_ns, self._rest_mark_m = t_ns, encoder_m
-        return moved_m <= _REST_M_PER_S * since_s
+        self._still_windows_count = self._still_windows_count + 1 if moved_m <= _REST_M_PER_S * since_s else 0
+        return self._still_windows_count >= _STILL_WINDOWS
 
     def _guided(self, t_ns: int, in_phase_s: float) -> tuple[cia402.State, cia402.State]:
         """Keep the micro on the braking macro until that is slow, or until the sensor falls silent."""
         slow = abs(float(self.tracker.active.model["macro_velocity_m_per_s"][0])) < _REST_M_PER_S
         if (slow and in_phase_s > 0.1) or in_phase_s > _QUICK_STOP_TIMEOUT_S:
-            self._rest_mark_t_ns, self._rest_mark_m = t_ns, float("nan")
+            self._look_for_rest(t_ns)
             self._enter(Phase.QUICK_STOP, t_ns)
             return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
         return cia402.State.QUICK_STOP_ACTIVE, cia402.State.OPERATION_ENABLED
@@ -633,21 +649,29 @@ class Servo:
         hold["acceleration_m_per_s2"] = model["macro_acceleration_m_per_s2"]
 
     def _slow_down(self, passed: int) -> None:
-        """Bring the reference to rest at the drive's own stopping deceleration, half of it where an operator asked."""
+        """Bring the macro's reference to rest at its drive's ramp, half of it where an operator asked; the micro's too.
+
+        Each by itself: with the end's reference at rest at once and the micro's on its way for 10 ms more, a stop in the
+        midst of an identification sent the macro off by 20 um.
+        """
+        if passed == 0:
+            return
         hold = self.tracker.hold
         dt_s = passed * self._period_s
-        v = float(hold["velocity_m_per_s"][0])
+        rate = float(hold["relative_velocity_m_per_s"][0])
+        slower = rate * _RELATIVE_KEPT_RATIO**passed if abs(rate) > _RELATIVE_REST_M_PER_S else 0.0
+        v = float(hold["velocity_m_per_s"][0]) - rate
         share = 0.5 if self.stop in _GENTLE_STOPS else 1.0
         step = share * self._stop_deceleration * dt_s
         after = v - step if v > step else v + step if v < -step else 0.0
-        hold["position_m"] += 0.5 * (v + after) * dt_s
-        hold["velocity_m_per_s"] = after
-        hold["acceleration_m_per_s2"] = (after - v) / dt_s if after != 0.0 and dt_s > 0.0 else 0.0
-        hold["jerk_m_per_s3"] = 0.0
-        rate = float(hold["relative_velocity_m_per_s"][0])
+        hold["position_m"] += (0.5 * (v + after) + rate) * dt_s
+        hold["velocity_m_per_s"] = after + slower
         hold["relative_position_m"] += rate * dt_s
-        hold["relative_velocity_m_per_s"] = 0.9 * rate if abs(rate) > 1e-6 else 0.0
-        hold["relative_acceleration_m_per_s2"] = 0.0
+        hold["relative_velocity_m_per_s"] = slower
+        hold["relative_acceleration_m_per_s2"] = (slower - rate) / dt_s
+        macro_m_per_s2 = (after - v) / dt_s if after != 0.0 else 0.0
+        hold["acceleration_m_per_s2"] = macro_m_per_s2 + (slower - rate) / dt_s
+        hold["jerk_m_per_s3"] = 0.0
 
     # ---- what remains ------------------------------------------------------------------------------------------
 

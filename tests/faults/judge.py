@@ -16,10 +16,11 @@ from where its power went on it is computed how far such a one goes beside this 
 Rest is |v| < 1 mm/s, also for an axis that loses its power: one that is let go of faster has not come to rest, and
 its way goes on counting. From rest on a drive holds on its encoder. Its loop needs 0.2 s until it stands; that way is
 part of the travel, and no more than 0.2 mm, so no instant is judged by neither bar. An obstacle pushes the macro
-back, against a drive that holds; when it is gone the drive comes back to where its ramp ended, and a fifth of that
-way beyond, which is the overshoot of a position loop with an integral. That is a spring, no command: only forward
-travel is judged until the obstacle is gone and the loop stands, by the same bound; from there on the macro must stand
-as after any fault.
+back, against a drive that holds; when it is gone the drive comes back to where its ramp ended, and beyond: a fifth of
+that way, which is the overshoot of its position loop, and by what its integral was wound up to meanwhile. That is at
+most the rest of its greatest force, F / m - w^2 e at e from its goal, and throws it F / (m w^2) - e beyond. All that is
+a spring, no command: only forward travel is judged until the obstacle is gone and the loop stands, by the same bound;
+from there on the macro must stand as after any fault.
 """
 
 import contextlib
@@ -160,7 +161,8 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             free = min(int(np.searchsorted(t_ns, facts.fault_t_ns + round(1e9 * drawn.lasts_s))), end)
             stands = min(max(stands, free + RELEASED_SAMPLES), end)
             away_m = (position[at:stands] - position[at]) * np.sign(velocity[at])
-            back_m = OVERSHOOT * abs(float(position[stands - 1] - position[free]))
+            pushed_m = abs(float(position[stands - 1] - position[free]))
+            back_m = OVERSHOOT * pushed_m + max(0.0, of.drive_gives_m - pushed_m)
         else:
             away_m = np.abs(position[at:stands] - position[at])
         travel_m = float(away_m.max(initial=0.0))

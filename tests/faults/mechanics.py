@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 
+from sim_backend import drive_servo
 from sim_backend.machine import Machine, load_machine
 from stagectl.profile import PROFILES_FOLDER
 
@@ -22,6 +23,7 @@ class Mechanics:
     plan_m_per_s2: float  # what its moves are planned with
     plan_m_per_s3: float
     speed_limit_m_per_s: float  # the guard's
+    force_limit_n: float  # of the macro's drive, 0x6072
     travel_m: tuple[float, float]  # in which the guard wants to be able to stop it
 
     def _of(self, name: str) -> list[dict]:
@@ -35,6 +37,12 @@ class Mechanics:
         if micro is not None:
             change_n += _TOUCH_N + 2.0 * micro.spring_n_per_m * max(micro.stroke_m)
         return change_n / self.machine.macro.mass_kg
+
+    @property
+    def drive_gives_m(self) -> float:
+        """How far the macro's drive gives way under its greatest force while it holds on its encoder: F / (m w^2)."""
+        w = float(drive_servo.parameters(self.machine.macro)["bandwidth_rad_per_s"][0])
+        return self.force_limit_n / (self.machine.macro.mass_kg * w * w)
 
     def coasting_m_per_s(self, position_m: float, velocity_m_per_s: float) -> float:
         """Return how fast a macro may get that loses its power there: the guard's limit, and what it rolls down."""
@@ -64,5 +72,6 @@ def mechanics_of(name: str) -> Mechanics:
         plan,
         plan / _JERK_TIME_S,
         macro["velocity_limit_m_per_s"],
+        macro["force_limit_n"],
         (low_m - stray_m, high_m + stray_m),
     )

@@ -1,6 +1,8 @@
 """`python -m bench service`: what it makes of its runs, its journal, and its mutants."""
 
 import ast
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 from bench import service, service_batch, service_processes
-from bench.journal import Journal, beside_figures, sources_hash
+from bench.journal import APART, Journal, beside_figures, sources_hash
 from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
 from tests.faults import losses, real
@@ -71,6 +73,17 @@ def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path):
 
 def test_a_campaigns_journal_is_of_its_sources():
     assert beside_figures("test") == ROOT / "docs" / "journals" / f"test-{sources_hash()}.jsonl"
+
+
+def test_what_the_journal_leaves_out_is_imported_by_no_process_of_the_service():
+    parts = (
+        "stagectl.service.daemon, stagectl.commands.serve, stagectl.servo_process, stagectl.client, sim_backend.process"
+    )
+    code = f"import sys, {parts}, tests.faults.campaign, tests.faults.real; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    folders = [folder.replace("/", ".") for folder in APART]
+    assert all((ROOT / folder).is_dir() for folder in APART)
+    assert [one for one in done.stdout.split() if any(f"{one}.".startswith(f"{name}.") for name in folders)] == []
 
 
 def test_a_seed_with_real_processes_is_the_same_run_again_and_all_of_them_are_drawn():
