@@ -651,8 +651,8 @@ class Servo:
     def _slow_down(self, passed: int) -> None:
         """Bring the macro's reference to rest at its drive's ramp, half of it where an operator asked; the micro's too.
 
-        Each by itself: with the end's reference at rest at once and the micro's on its way for 10 ms more, a stop in the
-        midst of an identification sent the macro off by 20 um.
+        Each by itself: with the end's reference at rest at once and the micro's on its way for 10 ms more, a stop in
+        an identification sent the macro off by 20 um.
         """
         if passed == 0:
             return
