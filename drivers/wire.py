@@ -36,6 +36,9 @@ _POWERED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia4
 _NO_ERROR = b"\0\0"  # an EMCY that takes the one before back
 _DISAGREEMENTS_IN_A_ROW = 5  # a host that holds a SYNC up by a millisecond is no lost reference
 _CLOCK_SAMPLES = 200  # before the sample clock can tell that a number came too early
+_REPEATS_PROBABILITY = 1e-20  # that noise makes so many equal samples in a row
+_LEAST_REPEATS = 20  # of a sensor that is quieter than it is stated; as many cycles as may be without a sample at all
+_MOST_REPEATED_SHARE = 0.5  # of samples: above it a sensor may rest on one count
 _INDEX_STEP = 2e-8  # Ciddor's own uncertainty; below it the last digits of sensors flicker (0.01 K: 1e-8)
 _EARLIEST_SHARE = 0.5  # of the transport's constant part: no line of a sample younger than this can be there
 
@@ -139,6 +142,9 @@ class WireDecoder:
         self._disagreements = 0
         self._macro_moved = (math.nan, math.nan)  # counts of each axis when they last changed, and the encoder then
         self._end_moved = (math.nan, math.nan)
+        self._macro_moved_sequence = self._end_moved_sequence = math.inf  # and the sample
+        self._macro_repeats_limit = _repeats_limit(self.macro_m_per_count, sensor.noise_m)
+        self._end_repeats_limit = _repeats_limit(self.end_m_per_count, sensor.noise_m)
         self._earliest_ns = _EARLIEST_SHARE * sensor.transport_s * 1e9
         self._jump_m = sensor.jump_limit_m
         self._disagreement_m = sensor.encoder_disagreement_m
@@ -347,17 +353,29 @@ class WireDecoder:
         return text
 
     def _look_for_stuck_counts(self, encoder_m: float) -> None:
-        """Latch *reference lost* where an axis repeats its counts, to the last bit, while the drive moves."""
+        """Latch *reference lost* where an axis repeats its counts, to the last bit, more often than its noise can.
+
+        Or while the drive moves: with counts coarser than the noise nothing else tells.
+        """
         if self.macro_counts != self._macro_moved[0]:
-            self._macro_moved = (self.macro_counts, encoder_m)
+            self._macro_moved, self._macro_moved_sequence = (self.macro_counts, encoder_m), self.sequence
         if self.end_counts != self._end_moved[0]:
-            self._end_moved = (self.end_counts, encoder_m)
-        for axis, (_, moved_m) in (("macro", self._macro_moved), ("end", self._end_moved)):
+            self._end_moved, self._end_moved_sequence = (self.end_counts, encoder_m), self.sequence
+        for axis, moved_m, repeats, limit in (
+            ("macro", self._macro_moved[1], self.sequence - self._macro_moved_sequence, self._macro_repeats_limit),
+            ("end", self._end_moved[1], self.sequence - self._end_moved_sequence, self._end_repeats_limit),
+        ):
             if not abs(encoder_m - moved_m) <= self._disagreement_m:
                 away_um = abs(encoder_m - moved_m) * 1e6
                 self._lose_reference(
                     f"{axis} counts are stuck: the drive's encoder moved {away_um:.0f} um meanwhile, "
                     f"limit {self._disagreement_m * 1e6:.0f} um"
+                )
+                break
+            if not repeats <= limit:
+                self._lose_reference(
+                    f"{axis} counts are stuck: {repeats} samples after it repeat one to the last bit, limit {limit}; "
+                    "look at the counter, or state interferometer.noise_m as it is measured at rest"
                 )
                 break
 
@@ -396,6 +414,7 @@ class WireDecoder:
         self.reference_text = ""
         self.encoder_trusted = True
         self._macro_moved = self._end_moved = (math.nan, math.nan)
+        self._macro_moved_sequence = self._end_moved_sequence = math.inf
         self._compared_sequence = -2
         self._disagreements = 0
         return macro_shift_m, end_shift_m
@@ -421,6 +440,8 @@ class WireDecoder:
         "_disagreements",
         "_macro_moved",
         "_end_moved",
+        "_macro_moved_sequence",
+        "_end_moved_sequence",
         "air_index",
         "_air_number",
         "_air_target",
@@ -450,6 +471,17 @@ def _decoded(codec: Codec, payload: bytes, source: str) -> tuple[int, ...]:
         return codec.decode(payload)
     except LinkError as error:
         raise LinkError(f"{source}: {error}") from error
+
+
+def _repeats_limit(step_m: float, noise_m: float) -> float:
+    """Return how many samples in a row may be equal, a count being `step_m` wide; inf where all of them may.
+
+    Two samples fall on one count with a probability of step / (2 sqrt(pi) noise) where the step is the smaller.
+    """
+    share = step_m / (2.0 * math.sqrt(math.pi) * noise_m)
+    if not share < _MOST_REPEATED_SHARE:
+        return math.inf
+    return max(_LEAST_REPEATS, math.ceil(math.log(_REPEATS_PROBABILITY) / math.log(share)))
 
 
 def _loss_text(flags: int, single: bool) -> str:

@@ -173,8 +173,9 @@ class StageState:
         self._log.say("fault", fault.what, **fault.model_dump(exclude={"what", "at"}))
         self._figures.fault(fault.kind)
 
-    def _trip_by(self, stop: Stop, stage: Supervisor) -> None:
-        self._trip(faults.of_stop(stop, stage.detail, self._state, now_text(), self._memory.next_fault_number))
+    def _trip_by(self, stop: Stop, stage: Supervisor, stopped_in: State | None = None) -> None:
+        state = stopped_in or self._state
+        self._trip(faults.of_stop(stop, stage.detail, state, now_text(), self._memory.next_fault_number))
 
     def _fault_of(self, error: StagectlError) -> messages.Fault:
         return faults.of_error(error, self._state, now_text(), self._memory.next_fault_number)

@@ -11,7 +11,8 @@ plan may reach in it, or those forces may change by.
 
 A macro without power coasts: it has the way to its end stops instead, and may nowhere be faster than the guard lets it
 be where its power went, and what magnets and cables give it on the way. A micro without power has its winding shorted:
-from where its power went on it is computed how far such a one goes beside this macro, and it may go no further.
+from where its power went on it is computed how far such a one goes beside this macro, and it may go no further. A drive
+that hears nothing is stopped by its own watch, and detection is what that takes.
 
 Rest is |v| < 1 mm/s, also for an axis that loses its power: one that is let go of faster has not come to rest, and
 its way goes on counting. From rest on a drive holds on its encoder. Its loop needs 0.2 s until it stands; that way is
@@ -31,7 +32,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tests.faults.kinds import CYCLE_S, MACRO, MICRO, Drawn
+from tests.faults.kinds import CYCLE_S, MACRO, MICRO, SILENCE_S, Drawn
 from tests.faults.limp import shorted_way_m
 from tests.faults.mechanics import Mechanics, mechanics_of
 from tests.faults.scene import PROFILE, Facts
@@ -62,7 +63,10 @@ STRANGER, BACK, COURSE = "unauthorised command accepted", "not armed again", "we
 STRUCK, LIMP = "macro without power too fast", "micro without power too far"
 BARS = (TRAVEL, STRUCK, LIMP, STANDSTILL, BEGUN, LOST, UNREADABLE, STRANGER, BACK, COURSE)
 """What a run can miss."""
-GENTLE = "a: the greatest gain of speed until it was noticed, at most a plan's; behind an obstacle forward only"
+GENTLE = (
+    "a: the greatest gain of speed until it was noticed, at most a plan's; behind an obstacle forward only; "
+    "of a deaf drive from its own watch on"
+)
 """Where the bound differs from v t + a t^2 / 2 + (v + a t)^2 / (2 ramp) with what was true at the fault."""
 
 
@@ -167,7 +171,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             away_m = np.abs(position[at:stands] - position[at])
         travel_m = float(away_m.max(initial=0.0))
         if dark:
-            bound_m = _way_to_stops_m(velocity, position, at, of)
+            bound_m = _way_to_stops_m(velocity, position, at, stands, of)
             found += _too_fast(seen, at, stands, of)
         else:
             bound_m = back_m + _bound_m(t_ns, velocity, at, detection_s + facts.late_s, of, drawn.open_loop)
@@ -189,7 +193,8 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         if held_m > STANDSTILL_M:
             found.append((STANDSTILL, f"macro moved {held_m * 1e6:.0f} um after standstill, with power"))
         if noticed is not None and not dark:
-            begun = _begun_cycles(seen, record, noticed, facts.judged_until_t_ns)
+            heard = noticed if MACRO not in drawn.deaf else max(noticed, facts.fault_t_ns + round(1e9 * SILENCE_S))
+            begun = _begun_cycles(seen, record, heard, facts.judged_until_t_ns)
             if not begun <= BEGUN_CYCLES:
                 found.append((BEGUN, f"stop begun {begun:.0f} cycles after detection"))
     lost = _cycles_lost(facts, record, rests)
@@ -219,11 +224,13 @@ def _bound_m(
     return v * t + 0.5 * a * t * t + (v + a * t) ** 2 / (2.0 * of.ramp_m_per_s2)
 
 
-def _way_to_stops_m(velocity: np.ndarray, position: np.ndarray, at: int, of: Mechanics) -> float:
-    """Return the way of an axis without power: to the stop that it coasts to."""
+def _way_to_stops_m(velocity: np.ndarray, position: np.ndarray, at: int, end: int, of: Mechanics) -> float:
+    """Return the way of an axis without power: to the stop that it coasts to; thrown back there, to the other."""
     low_m, high_m = of.machine.macro.travel_m
-    way_m = high_m - position[at] if velocity[at] > 0.0 else position[at] - low_m
-    return float(way_m) + STOPS_GIVE_M
+    down_m, up_m = float(position[at] - low_m), float(high_m - position[at])
+    goes_up = bool(velocity[at] > 0.0)
+    struck = bool((position[at:end] >= high_m).any() if goes_up else (position[at:end] <= low_m).any())
+    return (max(down_m, up_m) if struck else up_m if goes_up else down_m) + STOPS_GIVE_M
 
 
 def _too_fast(seen: dict[str, Any], at: int, end: int, of: Mechanics) -> list[tuple[str, str]]:

@@ -19,6 +19,7 @@ TPDOS, RPDOS = (MACRO_TPDO, MICRO_TPDO), (MACRO_RPDO, MICRO_RPDO)
 
 CYCLE_S = 1e-3
 SILENCE_S = 0.021  # 20 cycles without process data, RPDO or SYNC, and the one that notices
+REPEATS_S = 0.022  # 20 samples that repeat one, and two cycles
 AT_ONCE_S = 0.003  # a line on its way, the cycle that reads it, one more
 _HEARTBEAT_S = 0.265  # trip.heartbeat_s, a heartbeat's own period, and two looks of the supervisor
 _MASTER_HEARTBEAT_S = 0.205
@@ -46,6 +47,7 @@ class Drawn:
     detection_s: float = NEVER_S  # NEVER_S: from the instant that the controller says it noticed
     lasts_s: float = 0.0
     without_power: tuple[int, ...] = ()  # nodes that can't brake
+    deaf: tuple[int, ...] = ()  # nodes that hear no command: their own watch stops them
     open_loop: bool = False  # the drive keeps its last force until the fault is noticed
     pushed: bool = False  # by something that is no command: how far is not judged
 
@@ -122,7 +124,14 @@ def frames_short(rng: np.random.Generator, phase: str) -> Drawn:
     can_id = one_of(rng, (*TPDOS, *RPDOS))
     length = int(rng.integers(0, 4))
     fault = Fault("short_frame", can_id=can_id, length_count=length, duration_s=0.05)
-    return Drawn(f"frame 0x{can_id:03X} of {length} bytes", (fault,), detection_s=AT_ONCE_S, lasts_s=0.05)
+    deaf = (can_id & 0x7F,) if can_id in RPDOS else ()
+    return Drawn(
+        f"frame 0x{can_id:03X} of {length} bytes",
+        (fault,),
+        detection_s=SILENCE_S if MACRO in deaf else AT_ONCE_S,
+        lasts_s=0.05,
+        deaf=deaf,
+    )
 
 
 def bus_off(rng: np.random.Generator, phase: str) -> Drawn:
@@ -257,14 +266,11 @@ def sensor_restart(rng: np.random.Generator, phase: str) -> Drawn:
 def counts_stuck(rng: np.random.Generator, phase: str) -> Drawn:
     duration_s = between(rng, 0.03, 0.8)
     fault = Fault("stuck_counts", duration_s=duration_s)
-    must = phase == "constant speed"
-    return Drawn(
-        f"counts stuck for {duration_s * 1e3:.0f} ms",
-        (fault,),
-        must_stop=must,
-        detection_s=0.01 if must else NEVER_S,
-        lasts_s=duration_s,
-    )
+    told_by = {"homing": NEVER_S, "constant speed": 0.01}  # before a homing nothing is asked of a sensor; the encoder's
+    detection_s = told_by.get(phase, REPEATS_S)
+    must = detection_s != NEVER_S
+    text = f"counts stuck for {duration_s * 1e3:.0f} ms"
+    return Drawn(text, (fault,), must_stop=must, detection_s=detection_s, lasts_s=duration_s)
 
 
 def clock_drift(rng: np.random.Generator, phase: str) -> Drawn:

@@ -203,6 +203,30 @@ def test_what_a_plan_may_gain_counts_only_where_speed_was_gained():
     assert TRAVEL not in {bar for bar, _ in verdict.violations}
 
 
+@pytest.mark.parametrize(("turns_at_m", "missed"), [(0.501, set()), (0.45, {TRAVEL})])
+def test_a_macro_without_power_comes_back_only_from_a_stop_that_it_struck(turns_at_m, missed):
+    facts, record = rest_after(2.0)
+    dark = replace(FAULT, without_power=(MACRO,))
+    facts.seen["states"][1000:, 0] = 1
+    t_s, begin_m = facts.seen["t_ns"] * 1e-9, facts.seen["macro_position_m"][1000]
+    there_m = begin_m + 0.4 * (t_s - 1.0).clip(min=0.0)
+    comes_back = there_m >= turns_at_m
+    position = np.where(comes_back, 2.0 * turns_at_m - there_m, there_m)[1000:]
+    facts.seen["macro_position_m"][1000:] = facts.seen["end_position_m"][1000:] = position
+    facts.seen["macro_velocity_m_per_s"][1000:] = np.where(comes_back, -0.4, 0.4)[1000:]
+    assert bars_missed(facts, record, dark) == missed
+
+
+def test_a_deaf_drive_has_until_its_own_watch_and_no_longer():
+    for after_s, missed in ((0.02, set()), (0.03, {BEGUN})):
+        facts, record = rest_after(2.0, noticed_s=after_s)
+        record.columns["stop"][1002:] = 18
+        record.columns["run_phase"][1002:] = 6
+        fault = replace(FAULT, detection_s=0.04)
+        assert bars_missed(facts, record, fault) == {BEGUN}
+        assert bars_missed(facts, record, replace(fault, deaf=(MACRO,))) == missed
+
+
 def test_a_drift_without_power_is_measured_and_no_command():
     facts, record = rest_after(2.0)
     facts.seen["states"][1500:] = 1

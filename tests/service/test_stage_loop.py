@@ -296,6 +296,15 @@ def test_a_drive_that_breaks_on_the_way_to_a_rest_that_was_asked_for_is_a_fault(
     assert "0x7305" in armed.status.fault.values or "fault as the stage came to rest" in armed.status.fault.values
 
 
+def test_a_stage_that_stops_by_itself_is_shown_as_stopping_and_its_fault_says_where_from(armed):
+    backend = armed.loop._stage.backend
+    backend.rig.inject(Fault("emergency", node_id=1, code=ENCODER_FAULT), backend.wire.t_ns)
+    armed.until(lambda: armed.status.fault is not None)
+    states = [entry.fields["state"] for entry in armed.log.last(20) if entry.event == "state"]
+    assert states[-2:] == ["stopping", "fault"]
+    assert armed.status.fault.state == "armed"
+
+
 def test_what_is_said_to_a_jog_that_was_let_go_of_moves_nothing(armed):
     desk, token = armed.desk, armed.token
     velocity = messages.JogAt(velocity_m_per_s=0.05)
