@@ -19,7 +19,7 @@ TPDOS, RPDOS = (MACRO_TPDO, MICRO_TPDO), (MACRO_RPDO, MICRO_RPDO)
 
 CYCLE_S = 1e-3
 SILENCE_S = 0.021  # 20 cycles without process data, RPDO or SYNC, and the one that notices
-REPEATS_S = 0.022  # 20 samples that repeat one, and two cycles
+REPEATS_S = 0.014  # 12 samples that repeat one, and two cycles
 AT_ONCE_S = 0.003  # a line on its way, the cycle that reads it, one more
 _HEARTBEAT_S = 0.265  # trip.heartbeat_s, a heartbeat's own period, and two looks of the supervisor
 _MASTER_HEARTBEAT_S = 0.205

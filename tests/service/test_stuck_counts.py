@@ -41,10 +41,10 @@ def test_counts_that_repeat_to_the_last_bit_are_lost(held):
     fault = watched(held, WATCHED_S)
     assert fault is not None
     assert fault.kind == "REFERENCE_LOST"
-    assert "macro counts are stuck: 21 samples after it repeat one to the last bit, limit 20" in fault.values
+    assert "macro counts are stuck: 13 samples after it repeat one to the last bit, limit 12" in fault.values
 
 
 @pytest.mark.parametrize("held", ["oled-printer-umd2"], indirect=True)
 def test_counts_coarser_than_the_noise_may_rest(held):
-    held.inject(Fault("stuck_counts", duration_s=0.025))  # longer, and what it holds by drifts off
+    held.inject(Fault("stuck_counts", duration_s=0.02))  # longer, and what it holds by drifts off
     assert watched(held, WATCHED_S) is None
