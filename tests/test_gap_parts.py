@@ -318,9 +318,9 @@ def test_one_elimination_gives_what_solving_anew_gives():
     judge = _judge(0.3)
     start = [judge.library[0]]
     before = judge.gain(start)
-    fold = Fold([*judge.base, *start], judge.training, judge.training, on_noise=False)
+    fold = Fold([*judge.base, *start], judge.training, on_noise=False)
     for group in judge.library[1:]:
-        assert fold.added(group)[0][0] == pytest.approx(judge.gain([*start, group]) - before, abs=1e-5)
+        assert fold.added(group)[0] == pytest.approx(judge.gain([*start, group]) - before, abs=1e-5)
 
 
 @functools.cache

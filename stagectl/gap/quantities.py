@@ -91,7 +91,8 @@ def _at_samples(fine: np.ndarray) -> np.ndarray:
 
 def along_motion(effect: Effect, arguments: list[np.ndarray], parameters: list[float]) -> np.ndarray:
     """Run a law in time order over arrays of its quantities, all of shape (n, parts); shape kept."""
-    columns = np.column_stack([np.ascontiguousarray(values).ravel() for values in arguments])
+    flat = [np.ascontiguousarray(values).ravel() for values in arguments]
+    columns = flat[0][:, None] if len(flat) == 1 else np.column_stack(flat)
     memory = np.zeros(max(effect.memory, 1))
     out = compose.along(effect)(columns, np.array([*parameters, 0.0]), memory)
     return np.asarray(out).reshape(arguments[0].shape)
