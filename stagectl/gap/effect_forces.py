@@ -7,7 +7,7 @@ from stagectl.gap import late_readings
 from stagectl.gap.command_path import changed_by
 from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
 from stagectl.gap.late_readings import makes_late
-from stagectl.gap.quantities import along_motion, quantities
+from stagectl.gap.quantities import along_motion, arguments_of, quantities
 from stagectl.gap.reading_errors import SMALL_M, misread, more_contact_n, reading_error_m
 from stagectl.gap.recording import Recording, contact_push_n, relative_motion, with_late
 
@@ -86,8 +86,7 @@ def effect_forces(
     if Trait.SWINGS in effect.traits:
         value = _swung_n(recording, axis, effect, parameters)
     else:
-        known = quantities(recording, axis, place)
-        value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
+        value = along_motion(effect, arguments_of(recording, axis, place, effect), parameters)
     if place == "contact":
         value = _contact_changed(recording, value, whole)
     if place in ("contact", "joint"):

@@ -308,4 +308,6 @@ def _stacked(parts: list[np.ndarray | None], scale: float) -> np.ndarray | None:
     size = next((part.size for part in parts if part is not None), 0)
     if not size:
         return None
+    if len(parts) == 1 and parts[0] is not None:
+        return parts[0][None, :] / scale
     return np.stack([np.zeros(size) if part is None else part for part in parts]) / scale

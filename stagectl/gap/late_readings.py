@@ -46,13 +46,13 @@ def _late_s(effect: Effect, parameters: list[float], t_s: np.ndarray) -> np.ndar
     """Return how late readings are: what is missing of one that moves at 1 m/s."""
     if "t_s" not in effect.quantities and t_s.size > 1:
         return np.full(t_s.size, _late_s(effect, parameters, t_s[:1])[0])
-    known = {name: np.zeros_like(t_s) for name in effect.quantities} | {"velocity_m_per_s": np.ones_like(t_s)}
-    known |= {"t_s": t_s} if "t_s" in known else {}
-    columns = np.column_stack([known[name] for name in effect.quantities])
-    still = columns.copy()
-    still[:, effect.quantities.index("velocity_m_per_s")] = 0.0
+    columns = np.zeros((t_s.size, len(effect.quantities)))
+    if "t_s" in effect.quantities:
+        columns[:, effect.quantities.index("t_s")] = t_s
     law, values = compose.along(effect), np.array([*parameters, 0.0])
-    return np.asarray(law(still, values, np.zeros(1))) - np.asarray(law(columns, values, np.zeros(1)))
+    still = np.asarray(law(columns, values, np.zeros(1)))
+    columns[:, effect.quantities.index("velocity_m_per_s")] = 1.0
+    return still - np.asarray(law(columns, values, np.zeros(1)))
 
 
 def delay_s(rows: Sequence[Row], axis: str, log: Log) -> np.ndarray:
@@ -153,12 +153,20 @@ def motion_now(rows: Sequence[Row], axis: str, log: Log, motion: Motion) -> Moti
         part_s = log.period_s / PARTS_COUNT
         t_s = log.start_s + part_s * (np.arange(x.size) + 0.5)
         late_s = _late_s(effect, parameters, t_s + _late_s(effect, parameters, t_s))
-        there = np.clip(np.arange(x.size) + np.rint(late_s / part_s).astype(int), 0, x.size - 1)
-        rest_s = late_s - part_s * (there - np.arange(x.size))
-        x, v, a = x.ravel()[there], v.ravel()[there], a.ravel()[there]
-        motion = replace(
-            motion,
-            position_m=(x + rest_s * v + 0.5 * rest_s**2 * a).reshape(motion.position_m.shape),
-            velocity_m_per_s=(v + rest_s * a).reshape(motion.position_m.shape),
-        )
+        position_m, rate_m_per_s = _read_later(x.ravel(), v.ravel(), a.ravel(), late_s, part_s)
+        motion = replace(motion, position_m=position_m.reshape(x.shape), velocity_m_per_s=rate_m_per_s.reshape(x.shape))
     return motion
+
+
+@compiled
+def _read_later(
+    x: np.ndarray, v: np.ndarray, a: np.ndarray, late_s: np.ndarray, part_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return position and velocity on parts of intervals, from the motion that is read `late_s` after them."""
+    position_m, rate_m_per_s = np.empty(x.size), np.empty(x.size)
+    for k in range(x.size):
+        there = min(max(k + int(np.rint(late_s[k] / part_s)), 0), x.size - 1)
+        rest_s = late_s[k] - part_s * (there - k)
+        position_m[k] = x[there] + rest_s * v[there] + 0.5 * rest_s**2 * a[there]
+        rate_m_per_s[k] = v[there] + rest_s * a[there]
+    return position_m, rate_m_per_s
