@@ -8,16 +8,21 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from stagectl.effects import CATALOGUE
 from stagectl.errors import RecordError, RequestError
-from stagectl.gap import balance, innovations
+from stagectl.gap import balance, hypotheses, innovations, refinement
 from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.competition import Competition
+from stagectl.gap.evidence import Added
 from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.forces import Forces
+from stagectl.gap.hypotheses import widest_amplitudes
 from stagectl.gap.innovations import moments
 from stagectl.gap.left_over import one_curve_for_many
 from stagectl.gap.log import Log, log_of_rows
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
+from stagectl.gap.refinement import Refiner, left_to_gain
 from stagectl.gap.selection import Judge
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
@@ -365,6 +370,69 @@ def test_hidden_dry_friction_is_named_and_nothing_where_nothing_is_missing(frict
     sd = findings.refitted_sds["macro_mass_kg"]
     assert 0.0 < sd < 0.01
     assert findings.refitted["macro_mass_kg"] == pytest.approx(-0.005, abs=3.0 * sd)
+
+
+@functools.cache
+def _search() -> Competition:
+    recordings = [balance.recording_of(_axis_log("run 1", 1.0, 1), _believed())]
+    return Competition(recordings, 1, noise=noise_of(recordings))
+
+
+def test_columns_that_come_later_have_the_products_that_all_columns_have():
+    evidence = _search().evidence
+    terms = [
+        hypotheses.term_of(CATALOGUE["coulomb_friction"], "macro_force", {"smoothing_m_per_s": 1e-3}),
+        hypotheses.term_of(CATALOGUE["base_vibration"], "macro_force", {"frequency_hz": 7.0}),  # two columns
+        hypotheses.term_of(CATALOGUE["cubic_stiffness"], "macro_force", {}),
+    ]
+    before = evidence.sums[0].gram.shape[0]
+    added = [Added(term, evidence.columns_of(term), widest_amplitudes(term), 1) for term in terms]
+    groups = evidence.append_all(added)
+    assert [group.columns for group in groups] == [(before,), (before + 1, before + 2), (before + 3,)]
+    channels = evidence.channels[0]
+    expected = np.zeros_like(evidence.sums[0].gram)
+    for channel in channels:
+        rows = np.stack(channel.rows)
+        expected[np.ix_(channel.numbers, channel.numbers)] += rows @ rows.T
+    size = np.sqrt(np.diag(expected))
+    assert np.max(np.abs(evidence.sums[0].gram - expected) / np.maximum(np.outer(size, size), 1e-300)) < 1e-12
+    (alone,) = evidence.append_all(added[:1])
+    assert evidence.sums[0].gram[alone.columns[0], :before] == pytest.approx(expected[before, :before], rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("seen", "left"),
+    [
+        ({0.0: -1.0, 1.0: 0.0, 2.0: -1.0}, 0.0),
+        ({0.0: -2.25, 1.0: -0.25, 2.0: -0.25, 9.0: -56.25}, 0.25),  # -(x - 1.5)^2
+        ({1.0: 3.0, 0.0: 3.0, 2.0: 3.0, 3.0: 3.0}, float("inf")),  # the first one is at an end
+        ({0.0: -1e300, 1.0: 3.0, 2.0: -1e300}, 0.0),
+        ({0.0: 1.0, 1.0: 3.0}, float("inf")),
+    ],
+)
+def test_what_a_line_may_still_gain_is_what_its_parabola_says(seen, left):
+    assert left_to_gain(seen) == pytest.approx(left)
+
+
+def test_a_line_ends_where_nothing_is_left_to_gain(monkeypatch):
+    """Less work, and a shape that is as good to a hundredth of a square of the noise a line."""
+    search = _search()
+    term = hypotheses.term_of(CATALOGUE["cogging"], "macro_force", {"pitch_m": 0.004})
+    outcomes = {}
+    for least in (0.0, 0.01):
+        monkeypatch.setattr(refinement, "_LINE_GAIN", least)
+        refiner = Refiner(search.evidence, search.judge.base)
+        asked = []
+        monkeypatch.setattr(
+            refiner, "_gain", lambda tried, of=None, asked=asked, refiner=refiner: asked.append(tried)
+            or Refiner._gain(refiner, tried, of)
+        )  # fmt: skip
+        found = refiner.refined(term)
+        assert found is not None
+        outcomes[least] = len(asked), Refiner._gain(refiner, found[0])
+    (every, best), (fewer, gained) = outcomes[0.0], outcomes[0.01]
+    assert fewer < every
+    assert best - 0.02 < gained <= best + 0.02
 
 
 def test_a_wrong_name_makes_no_noise_that_hides_what_it_leaves():
