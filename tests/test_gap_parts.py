@@ -289,6 +289,21 @@ def test_many_names_that_one_curve_does_as_well_as_are_one_effect_without_a_name
     assert one_curve_for_many(judge, [*names[:2], beside])[1] is None
 
 
+@pytest.mark.parametrize(("beside_count", "fourth", "is_missing"), [(3, 0.2, True), (2, 0.2, False), (3, 0.6, False)])
+def test_where_a_curve_explains_more_than_a_fourth_name_there_is_none(beside_count, fourth, is_missing):
+    """Names that stand, a curve that explains 0.4 of a deviation, and a name that explains less or more."""
+
+    def draw(run, random):
+        parts = [random.standard_normal(4000) for _ in range(5)]
+        return [random.standard_normal(4000) + sum(parts[:3]) + fourth * parts[3] + 0.4 * parts[4], *parts]
+
+    names = [Group((f"name {k}", f"place {k}"), (1 + k,)) for k in range(4)]
+    curve = Group(("curve over position_m", "macro_force"), (5,))
+    judge = _table_judge(draw, names, curves=[curve])
+    assert judge.lacks_a_name([*names[3 - beside_count : 3]]) is is_missing
+    assert {group.key for group in judge.select()} == {group.key for group in names[: 3 if fourth < 0.4 else 4]}
+
+
 def test_of_two_places_that_a_few_sizes_were_tried_at_the_better_one_is_taken():
     """A size that fits the wrong place by chance: each place is compared at the size that it asks for."""
 
