@@ -10,7 +10,7 @@ from scipy import signal
 
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RecordError, RequestError
-from stagectl.gap import balance, hypotheses, innovations, refinement
+from stagectl.gap import balance, hypotheses, innovations
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.competition import Competition
 from stagectl.gap.evidence import Added
@@ -22,7 +22,6 @@ from stagectl.gap.left_over import one_curve_for_many
 from stagectl.gap.log import Log, log_of_rows
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
-from stagectl.gap.refinement import Refiner, left_to_gain
 from stagectl.gap.selection import Judge
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
@@ -413,41 +412,6 @@ def test_columns_that_come_later_have_the_products_that_all_columns_have():
     assert np.max(np.abs(evidence.sums[0].gram - expected) / np.maximum(np.outer(size, size), 1e-300)) < 1e-12
     (alone,) = evidence.append_all(added[:1])
     assert evidence.sums[0].gram[alone.columns[0], :before] == pytest.approx(expected[before, :before], rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("seen", "left"),
-    [
-        ({0.0: -1.0, 1.0: 0.0, 2.0: -1.0}, 0.0),
-        ({0.0: -2.25, 1.0: -0.25, 2.0: -0.25, 9.0: -56.25}, 0.25),  # -(x - 1.5)^2
-        ({1.0: 3.0, 0.0: 3.0, 2.0: 3.0, 3.0: 3.0}, float("inf")),  # the first one is at an end
-        ({0.0: -1e300, 1.0: 3.0, 2.0: -1e300}, 0.0),
-        ({0.0: 1.0, 1.0: 3.0}, float("inf")),
-    ],
-)
-def test_what_a_line_may_still_gain_is_what_its_parabola_says(seen, left):
-    assert left_to_gain(seen) == pytest.approx(left)
-
-
-def test_a_line_ends_where_nothing_is_left_to_gain(monkeypatch):
-    """Less work, and a shape that is as good to a hundredth of a square of the noise a line."""
-    search = _search()
-    term = hypotheses.term_of(CATALOGUE["cogging"], "macro_force", {"pitch_m": 0.004})
-    outcomes = {}
-    for least in (0.0, 0.01):
-        monkeypatch.setattr(refinement, "_LINE_GAIN", least)
-        refiner = Refiner(search.evidence, search.judge.base)
-        asked = []
-        monkeypatch.setattr(
-            refiner, "_gain", lambda tried, of=None, asked=asked, refiner=refiner: asked.append(tried)
-            or Refiner._gain(refiner, tried, of)
-        )  # fmt: skip
-        found = refiner.refined(term)
-        assert found is not None
-        outcomes[least] = len(asked), Refiner._gain(refiner, found[0])
-    (every, best), (fewer, gained) = outcomes[0.0], outcomes[0.01]
-    assert fewer < every
-    assert best - 0.02 < gained <= best + 0.02
 
 
 def test_a_wrong_name_makes_no_noise_that_hides_what_it_leaves():

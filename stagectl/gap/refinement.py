@@ -5,8 +5,7 @@ solved for at each point (variable projection, Golub and Pereyra 1973). Effects 
 edge that moves by more than the stage touches) are searched in all their parameters, at their size. Pure.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -46,16 +45,8 @@ _SLOPE_RATIO = 1e-4
 """Share of the range of a search that a slope is taken over."""
 
 _TOLERANCE_RATIO = 3e-3
-_LINE_GAIN = 0.01
-"""Squares of the noise that a line may leave to be gained: a tenth of a deviation of the shape that is searched."""
-
-_TOLD_COUNT = 2  # trials one after the other that say so: points far apart can do so by chance
 _WORST = 1e300
 _LARGEST = 1e100
-
-
-class _Enough(Exception):
-    """A line has nothing more to gain."""
 
 
 class Refiner:
@@ -169,26 +160,18 @@ class Refiner:
         if not high > low:
             return shape, best
 
-        seen = {shape[name]: best}
-        told_count = 0
-
         def loss(value: float) -> float:
-            nonlocal told_count
-            seen[float(value)] = gain = self._gain(with_shape(term, shape | {name: float(value)}))
-            told_count = told_count + 1 if left_to_gain(seen) < _LINE_GAIN else 0
-            if told_count == _TOLD_COUNT:
-                raise _Enough
-            return -gain
+            return -self._gain(with_shape(term, shape | {name: float(value)}))
 
-        with suppress(_Enough):
-            minimize_scalar(
-                loss,
-                bounds=(low, high),
-                method="bounded",
-                options={"xatol": _TOLERANCE_RATIO * (high - low), "maxiter": 16},
-            )
-        found = max(seen, key=seen.__getitem__)
-        return shape | {name: found}, seen[found]
+        outcome = minimize_scalar(
+            loss,
+            bounds=(low, high),
+            method="bounded",
+            options={"xatol": _TOLERANCE_RATIO * (high - low), "maxiter": 16},
+        )
+        if -outcome.fun > best:
+            return shape | {name: float(outcome.x)}, float(-outcome.fun)
+        return shape, best
 
     def _stepped(self, term: Term, free: Sequence[str], best: float) -> tuple[Term, float]:
         """Return a term at its size at the shapes that its slopes ask for, as long as a step gains (Gauss-Newton).
@@ -286,19 +269,6 @@ class Refiner:
                 if rows is not None:
                     cross[[here[k] for k in present], mine] += rows @ part.T
         return normal - cross.T @ self._inverse @ cross, right - cross.T @ self._values
-
-
-def left_to_gain(seen: Mapping[float, float]) -> float:
-    """Return what the parabola through the best point and its neighbours is higher than that; inf at an end."""
-    points = sorted(seen)
-    at = max(range(len(points)), key=lambda k: seen[points[k]])
-    if at in (0, len(points) - 1):
-        return float("inf")
-    low, best, high = points[at - 1 : at + 2]
-    rise = (seen[best] - seen[low]) / (best - low)
-    bend = ((seen[high] - seen[best]) / (high - best) - rise) / (high - low)
-    slope = rise + bend * (best - low)
-    return slope * slope / (-4.0 * bend) if bend < 0.0 else 0.0
 
 
 def _difference(a: Columns, b: Columns) -> Columns:
