@@ -5,6 +5,7 @@ memories from another, which stands in the plant's state; so its text depends on
 on their values (masking 35 slots instead costs 46 ns a call).
 """
 
+import functools
 import hashlib
 import importlib.util
 import os
@@ -254,12 +255,18 @@ def along(known: Effect) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.nd
 
     columns: float64 (rows, quantities in the order of the declaration); memory is left as the last row leaves it.
     """
-    arguments = [f"columns[k, {j}]" for j in range(len(known.quantities))]
-    arguments += [f"parameters[{j}]" for j in range(len(known.parameters))]
-    arguments += ["memory"] if known.memory else []
-    return generated_module(
-        "along", _ALONG.format(name=known.name, origin=_of(known.name), arguments=", ".join(arguments))
-    ).along
+    return _along(known.name, _of(known.name), len(known.quantities), len(known.parameters), known.memory > 0)
+
+
+@functools.cache
+def _along(
+    name: str, origin: str, quantities_count: int, parameters_count: int, remembers: bool
+) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """Return it, composed once: a search asks tens of thousands of times."""
+    arguments = [f"columns[k, {j}]" for j in range(quantities_count)]
+    arguments += [f"parameters[{j}]" for j in range(parameters_count)]
+    arguments += ["memory"] if remembers else []
+    return generated_module("along", _ALONG.format(name=name, origin=origin, arguments=", ".join(arguments))).along
 
 
 def plant_module(effects: Iterable[Mapping[str, Any]]) -> ModuleType:

@@ -26,6 +26,19 @@ def _found(seed: int, duration_s: float, folder: Path) -> tuple[Named, dict[str,
     return named, hidden
 
 
+def test_a_force_that_no_effect_is_ends_the_search_at_three_names(tmp_path):
+    """To six names, and in a look closer: 49 times names were ranked, each at its best shape; 15 times now."""
+    case = generate.draw(2600, "outside", 2.0)
+    generate.write(case, tmp_path)
+    blind = load_set(tmp_path)
+    said: list[str] = []
+    findings = find(blind.believed, list(blind.logs)[:RUNS_COUNT], [], nulls_count=20, say=said.append)
+    assert findings.verdict == "unknown"
+    assert findings.unknown is not None
+    assert 0 < len(findings.unknown["beside"]) <= 3
+    assert sum(text.startswith("once more") for text in said) == 1
+
+
 def test_a_cyclic_error_has_its_size_along_readings_without_it(tmp_path):
     """Along what the past foretells, which such an error spoils by 0.1 um, 17.9 nm were 1.9 nm."""
     named, effect = _found(2119, 5.0, tmp_path)

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from stagectl.effects import CATALOGUE
 from stagectl.errors import RecordError, RequestError
-from stagectl.gap import balance, innovations
+from stagectl.gap import balance, hypotheses, innovations
 from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.competition import Competition
+from stagectl.gap.evidence import Added
 from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.forces import Forces
+from stagectl.gap.hypotheses import widest_amplitudes
 from stagectl.gap.innovations import moments
 from stagectl.gap.left_over import one_curve_for_many
 from stagectl.gap.log import Log, log_of_rows
@@ -284,6 +288,21 @@ def test_many_names_that_one_curve_does_as_well_as_are_one_effect_without_a_name
     assert one_curve_for_many(judge, [*names[:2], beside])[1] is None
 
 
+@pytest.mark.parametrize(("beside_count", "fourth", "is_missing"), [(3, 0.2, True), (2, 0.2, False), (3, 0.6, False)])
+def test_where_a_curve_explains_more_than_a_fourth_name_there_is_none(beside_count, fourth, is_missing):
+    """Names that stand, a curve that explains 0.4 of a deviation, and a name that explains less or more."""
+
+    def draw(run, random):
+        parts = [random.standard_normal(4000) for _ in range(5)]
+        return [random.standard_normal(4000) + sum(parts[:3]) + fourth * parts[3] + 0.4 * parts[4], *parts]
+
+    names = [Group((f"name {k}", f"place {k}"), (1 + k,)) for k in range(4)]
+    curve = Group(("curve over position_m", "macro_force"), (5,))
+    judge = _table_judge(draw, names, curves=[curve])
+    assert judge.lacks_a_name([*names[3 - beside_count : 3]]) is is_missing
+    assert {group.key for group in judge.select()} == {group.key for group in names[: 3 if fourth < 0.4 else 4]}
+
+
 def test_of_two_places_that_a_few_sizes_were_tried_at_the_better_one_is_taken():
     """A size that fits the wrong place by chance: each place is compared at the size that it asks for."""
 
@@ -318,9 +337,9 @@ def test_one_elimination_gives_what_solving_anew_gives():
     judge = _judge(0.3)
     start = [judge.library[0]]
     before = judge.gain(start)
-    fold = Fold([*judge.base, *start], judge.training, judge.training, on_noise=False)
+    fold = Fold([*judge.base, *start], judge.training, on_noise=False)
     for group in judge.library[1:]:
-        assert fold.added(group)[0][0] == pytest.approx(judge.gain([*start, group]) - before, abs=1e-5)
+        assert fold.added(group)[0] == pytest.approx(judge.gain([*start, group]) - before, abs=1e-5)
 
 
 @functools.cache
@@ -365,6 +384,34 @@ def test_hidden_dry_friction_is_named_and_nothing_where_nothing_is_missing(frict
     sd = findings.refitted_sds["macro_mass_kg"]
     assert 0.0 < sd < 0.01
     assert findings.refitted["macro_mass_kg"] == pytest.approx(-0.005, abs=3.0 * sd)
+
+
+@functools.cache
+def _search() -> Competition:
+    recordings = [balance.recording_of(_axis_log("run 1", 1.0, 1), _believed())]
+    return Competition(recordings, 1, noise=noise_of(recordings))
+
+
+def test_columns_that_come_later_have_the_products_that_all_columns_have():
+    evidence = _search().evidence
+    terms = [
+        hypotheses.term_of(CATALOGUE["coulomb_friction"], "macro_force", {"smoothing_m_per_s": 1e-3}),
+        hypotheses.term_of(CATALOGUE["base_vibration"], "macro_force", {"frequency_hz": 7.0}),  # two columns
+        hypotheses.term_of(CATALOGUE["cubic_stiffness"], "macro_force", {}),
+    ]
+    before = evidence.sums[0].gram.shape[0]
+    added = [Added(term, evidence.columns_of(term), widest_amplitudes(term), 1) for term in terms]
+    groups = evidence.append_all(added)
+    assert [group.columns for group in groups] == [(before,), (before + 1, before + 2), (before + 3,)]
+    channels = evidence.channels[0]
+    expected = np.zeros_like(evidence.sums[0].gram)
+    for channel in channels:
+        rows = np.stack(channel.rows)
+        expected[np.ix_(channel.numbers, channel.numbers)] += rows @ rows.T
+    size = np.sqrt(np.diag(expected))
+    assert np.max(np.abs(evidence.sums[0].gram - expected) / np.maximum(np.outer(size, size), 1e-300)) < 1e-12
+    (alone,) = evidence.append_all(added[:1])
+    assert evidence.sums[0].gram[alone.columns[0], :before] == pytest.approx(expected[before, :before], rel=1e-12)
 
 
 def test_a_wrong_name_makes_no_noise_that_hides_what_it_leaves():

@@ -85,13 +85,17 @@ def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = T
 
 def whitened(recording: Recording, axis: str, force_n: np.ndarray | None, position_m: np.ndarray | None) -> np.ndarray:
     """Return innovations of one body under forces and from positions, at judged samples, shape (m,)."""
+    return _whitened(recording, axis, None if force_n is None else innovations.moments(force_n), position_m)
+
+
+def _whitened(
+    recording: Recording, axis: str, force_n: tuple[np.ndarray, np.ndarray] | None, position_m: np.ndarray | None
+) -> np.ndarray:
+    """Return the same under the moments of forces."""
     log = recording.log
     level, gain, variance = recording.filters[axis]
     n = log.samples_count
-    if force_n is None:
-        mean_n = early_n = np.zeros(n)
-    else:
-        mean_n, early_n = innovations.moments(force_n)
+    mean_n, early_n = (np.zeros(n),) * 2 if force_n is None else force_n
     x = np.zeros(n) if position_m is None else position_m
     start_m = float(x[0]) if position_m is not None else 0.0
     out = innovations.innovations(
@@ -133,11 +137,12 @@ def column(recording: Recording, forces: Forces) -> list[np.ndarray | None]:
         ("end", forces.end_n, forces.end_sensor_m),
     ):
         if axis in recording.axes:
-            moved = force_n is not None and bool(np.any(force_n)), sensor_m is not None and bool(np.any(sensor_m))
-            if any(moved):
-                parts.append(whitened(recording, axis, None if force_n is None else -force_n, sensor_m))
-            else:
-                parts.append(None)
+            pulled_n = None
+            if force_n is not None:
+                mean_n, early_n = innovations.moments(force_n)
+                pulled_n = -mean_n, -early_n
+            moved = any(values is not None and bool(np.any(values)) for values in (*(pulled_n or ()), sensor_m))
+            parts.append(_whitened(recording, axis, pulled_n, sensor_m) if moved else None)
     for axis in recording.reported_a:
         current_a = forces.macro_current_a if axis == "macro" else forces.end_current_a
         parts.append(None if current_a is None else _scaled(recording, axis, current_a))

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from stagectl import compose
+from stagectl.compiled import compiled
 from stagectl.effects import Effect
 
 PARTS_COUNT = 4
@@ -58,21 +59,41 @@ def driven(command: np.ndarray, latch_s: float, lag_s: float, period_s: float) -
     starts = np.concatenate([command[:1], ends[:-1]])
     at_latch = before + (starts - before) * latch
     edges = np.arange(PARTS_COUNT + 1) / PARTS_COUNT
-    means = np.empty((command.size, PARTS_COUNT))
-    for part in range(PARTS_COUNT):
-        low, high = edges[part], edges[part + 1]
-        turn = min(max(rest, low), high)
-        means[:, part] = _area(starts, before, low, turn, 0.0, lag_s / period_s)
-        means[:, part] += _area(at_latch, now, turn, high, rest, lag_s / period_s)
-    return means * PARTS_COUNT, starts
+    lag = lag_s / period_s
+    turns = np.clip(rest, edges[:-1], edges[1:])
+    earlier = np.array([_area(low, turn, 0.0, lag) for low, turn in zip(edges[:-1], turns, strict=True)])
+    later = np.array([_area(turn, high, rest, lag) for turn, high in zip(turns, edges[1:], strict=True)])
+    return _relaxed(starts, before, at_latch, now, PARTS_COUNT * earlier, PARTS_COUNT * later), starts
 
 
-def _area(start: np.ndarray, goal: np.ndarray, low: float, high: float, origin: float, lag: float) -> np.ndarray:
-    """Integrate goal + (start - goal) exp(-(s - origin) / lag) from low to high."""
+def _area(low: float, high: float, origin: float, lag: float) -> tuple[float, float]:
+    """Integrate goal + (start - goal) exp(-(s - origin) / lag) from low to high: (what goal counts, start - goal)."""
     if not high > low:
-        return np.zeros_like(goal)
-    fading = lag * (np.exp(-(low - origin) / lag) - np.exp(-(high - origin) / lag))
-    return goal * (high - low) + (start - goal) * fading
+        return 0.0, 0.0
+    return high - low, lag * (np.exp(-(low - origin) / lag) - np.exp(-(high - origin) / lag))
+
+
+@compiled
+def _relaxed(
+    starts: np.ndarray,
+    before: np.ndarray,
+    at_latch: np.ndarray,
+    now: np.ndarray,
+    earlier: np.ndarray,
+    later: np.ndarray,
+) -> np.ndarray:
+    """Return means over parts, (n, parts), of what goes towards the earlier command, then towards the one that is now.
+
+    earlier, later: by part, what the goal counts and what the way to it.
+    """
+    means = np.empty((now.size, earlier.shape[0]))
+    for k in range(now.size):
+        for part in range(earlier.shape[0]):
+            means[k, part] = (
+                before[k] * earlier[part, 0] + (starts[k] - before[k]) * earlier[part, 1]
+                + now[k] * later[part, 0] + (at_latch[k] - now[k]) * later[part, 1]
+            )  # fmt: skip
+    return means
 
 
 def changed_by(

@@ -7,7 +7,7 @@ import numpy as np
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses, seeds
 from stagectl.gap.crew import Crew, Serial
-from stagectl.gap.evidence import Evidence
+from stagectl.gap.evidence import Added, Evidence
 from stagectl.gap.forces import Forces, scaled_forces
 from stagectl.gap.grids import free_shapes, grids_for
 from stagectl.gap.hypotheses import DEVIATION_SD, Term, widest_amplitudes
@@ -112,14 +112,13 @@ class Competition:
         )
         terms = [outcome[0] for outcome in outcomes if outcome is not None]
         columns = iter(self._crew.here(self.evidence.columns_of, terms))
-        found = []
-        for group, outcome in zip(groups, outcomes, strict=True):
-            if outcome is None:
-                found.append(group)
-                continue
-            term, count = outcome
-            found.append(self.evidence.append(term, next(columns), widest_amplitudes(term), max(group.searched, count)))
-        return found
+        added = [
+            Added(outcome[0], next(columns), widest_amplitudes(outcome[0]), max(group.searched, outcome[1]))
+            for group, outcome in zip(groups, outcomes, strict=True)
+            if outcome is not None
+        ]
+        appended = iter(self.evidence.append_all(added))
+        return [group if outcome is None else next(appended) for group, outcome in zip(groups, outcomes, strict=True)]
 
     def _gains_at_size(self, beside: Sequence[Group], groups: Sequence[Group]) -> list[float]:
         """Return what groups gain at their size; what a grid has at several sizes is asked for once."""

@@ -95,6 +95,8 @@ def _overlap(middle_m: float, rate: float, damping_s: float, part_s: float) -> t
     from_m = max(-damping_s * rate, 0.0)
     half_m = max(0.5 * part_s * abs(rate), _LEAST_M)
     top_m = middle_m + half_m
+    if not top_m > from_m:
+        return 0.0, 0.0
     share = min(max(0.5 * (top_m - from_m) / half_m, 0.0), 1.0)
     return share, 0.5 * share * (top_m + max(middle_m - half_m, from_m))
 

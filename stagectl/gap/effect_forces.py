@@ -7,9 +7,9 @@ from stagectl.gap import late_readings
 from stagectl.gap.command_path import changed_by
 from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
 from stagectl.gap.late_readings import makes_late
-from stagectl.gap.quantities import along_motion, quantities
+from stagectl.gap.quantities import along_motion, arguments_of, quantities
 from stagectl.gap.reading_errors import SMALL_M, misread, more_contact_n, reading_error_m
-from stagectl.gap.recording import Recording, contact_of, relative_motion, with_late
+from stagectl.gap.recording import Recording, contact_push_n, relative_motion, with_late
 
 
 def known_forces(recording: Recording, but: Trait | None = None) -> Forces:
@@ -65,8 +65,7 @@ def joint_force_n(recording: Recording) -> np.ndarray:
     if joint is None or end is None:
         raise KeyError("joint")
     x_b, x_b_rate = relative_motion(recording)
-    contact_n = contact_of(recording).push_n(joint, 0.0)
-    return contact_n + joint.spring_n_per_m * x_b + joint.damping_n_s_per_m * x_b_rate
+    return contact_push_n(recording, 0.0) + joint.spring_n_per_m * x_b + joint.damping_n_s_per_m * x_b_rate
 
 
 def effect_forces(
@@ -78,7 +77,6 @@ def effect_forces(
     needs it; `whole` takes it at its size: an error of 30 um puts the stage on the other side of an edge.
     """
     axis = "macro" if place.startswith("macro") else "end"
-    known = quantities(recording, axis, place)
     if makes_late(effect):
         return _later(recording, effect, place, parameters)
     if place.endswith("_sensor"):
@@ -88,7 +86,7 @@ def effect_forces(
     if Trait.SWINGS in effect.traits:
         value = _swung_n(recording, axis, effect, parameters)
     else:
-        value = along_motion(effect, [known[name] for name in effect.quantities], parameters)
+        value = along_motion(effect, arguments_of(recording, axis, place, effect), parameters)
     if place == "contact":
         value = _contact_changed(recording, value, whole)
     if place in ("contact", "joint"):
@@ -113,17 +111,25 @@ def _swung_n(recording: Recording, axis: str, effect: Effect, parameters: list[f
     In (1 - mu) q'' + 2 zeta w q' + w^2 q = -a_0 the others' a_0 is known. That is the law itself for no share at all,
     with a_0 / (1 - mu) and with frequency and damping over the root of 1 - mu.
     """
-    total = known_forces(recording, but=Trait.SWINGS)
-    add_forces(total, recording.found)
-    others_n = total.macro_n if axis == "macro" else total.end_n
-    if others_n is None:
-        raise KeyError(axis)
+    others_n = _others_n(recording, axis)
     share, frequency_hz, damping = parameters
     free = np.sqrt(1.0 - share)
     known = quantities(recording, axis, f"{axis}_force")
     driven = known | {"acceleration_m_per_s2": others_n / (recording.mass_kg(axis) * (1.0 - share))}
     arguments = [driven[name] for name in effect.quantities]
     return share / _TINY * along_motion(effect, arguments, [_TINY, frequency_hz / free, damping / free])
+
+
+def _others_n(recording: Recording, axis: str) -> np.ndarray:
+    """Return what acts on a body besides shares of its mass that swing, shape (n, parts)."""
+    if axis not in recording.others_n:
+        total = known_forces(recording, but=Trait.SWINGS)
+        add_forces(total, recording.found)
+        others_n = total.macro_n if axis == "macro" else total.end_n
+        if others_n is None:
+            raise KeyError(axis)
+        recording.others_n[axis] = others_n
+    return recording.others_n[axis]
 
 
 def _contact_changed(recording: Recording, pressing_n: np.ndarray, whole: bool) -> np.ndarray:
@@ -136,7 +142,7 @@ def _contact_changed(recording: Recording, pressing_n: np.ndarray, whole: bool) 
     if joint is None or recording.side is None:
         return 0.0 * pressing_n
     if whole:
-        there_n = recording.side * contact_of(recording).push_n(joint, recording.contact_damping_n_s_per_m)
+        there_n = recording.side * contact_push_n(recording, recording.contact_damping_n_s_per_m)
         pressing_n = np.maximum(pressing_n, -there_n)
     return recording.side * pressing_n
 

@@ -106,22 +106,21 @@ def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, 
     n = position_m.size
     out = np.zeros(n)
     h = period_s
+    moved, turned = 0.5 * h * h / mass_kg, h / mass_kg
     x = start_m
     v = 0.0
     d = 0.0
     e = 0.0
     dd, de, ed, ee = _slow(corner_rad_per_s * h)
     for k in range(n):
+        g0, g1, g2, g3 = gain[k, 0], gain[k, 1], gain[k, 2], gain[k, 3]
         z = position_m[k] - x
-        if gain[k, 0] != 0.0:
+        if g0 != 0.0:
             out[k] = z / np.sqrt(variance[k])
-        x += gain[k, 0] * z
-        v += gain[k, 1] * z
-        d += gain[k, 2] * z
-        e += gain[k, 3] * z
-        x += v * h + 0.5 * h * h * (early_n[k] + d) / mass_kg
-        v += h * (mean_n[k] + d) / mass_kg
-        d, e = dd * d + de * e, ed * d + ee * e
+        # what z adds is added last, by a gain that holds the step: sample waits for sample twelve cycles, not forty
+        x = (x + v * h + moved * (early_n[k] + d)) + (g0 + g1 * h + moved * g2) * z
+        v = (v + turned * (mean_n[k] + d)) + (g1 + turned * g2) * z
+        d, e = (dd * d + de * e) + (dd * g2 + de * g3) * z, (ed * d + ee * e) + (ed * g2 + ee * g3) * z
     return out
 
 
@@ -159,24 +158,29 @@ def filtered(position_m, valid, mean_n, early_n, gain, variance, mass_kg, period
     a, _, _ = _model(mass_kg, period_s, 0.0, 0.0, corner_rad_per_s)
     known, foretold = np.zeros((n, 3)), np.zeros((n, 2))
     unlikely = 0.0
-    x = np.zeros(_STATES)
-    x[0] = position_m[0]
-    pull = np.zeros(_STATES)
+    x, v, d, e = position_m[0], 0.0, 0.0, 0.0
     for k in range(n):
-        foretold[k] = x[:2]
+        foretold[k, 0], foretold[k, 1] = x, v
         if valid[k]:
-            z = position_m[k] - x[0]
+            z = position_m[k] - x
             unlikely += z * z / variance[k] + np.log(variance[k])
-            x = x + gain[k] * z
-        known[k] = x[:3]
-        pull[0] = 0.5 * h * h * early_n[k] / mass_kg
-        pull[1] = h * mean_n[k] / mass_kg
-        x = a @ x + pull
+            x, v, d, e = x + gain[k, 0] * z, v + gain[k, 1] * z, d + gain[k, 2] * z, e + gain[k, 3] * z
+        known[k, 0], known[k, 1], known[k, 2] = x, v, d
+        x += a[0, 1] * v + a[0, 2] * d + 0.5 * h * h * early_n[k] / mass_kg
+        v += a[1, 2] * d + h * mean_n[k] / mass_kg
+        d, e = a[2, 2] * d + a[2, 3] * e, a[3, 2] * d + a[3, 3] * e
     return known, foretold, unlikely
 
 
+@compiled
 def moments(fine_n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (mean, early-weighted mean) of forces on equal parts of each interval, shape (n, parts)."""
-    parts = fine_n.shape[1]
-    middles = (np.arange(parts) + 0.5) / parts
-    return fine_n @ np.full(parts, 1.0 / parts), fine_n @ (2.0 * (1.0 - middles)) / parts
+    n, parts = fine_n.shape
+    mean_n, early_n = np.empty(n), np.empty(n)
+    for k in range(n):
+        mean, early = 0.0, 0.0
+        for part in range(parts):
+            mean += fine_n[k, part]
+            early += 2.0 * (1.0 - (part + 0.5) / parts) * fine_n[k, part]
+        mean_n[k], early_n[k] = mean / parts, early / parts
+    return mean_n, early_n

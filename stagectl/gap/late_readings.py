@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from stagectl import compose
+from stagectl.compiled import compiled
 from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap.command_path import PARTS_COUNT, changed_by, driven, lagged
 from stagectl.gap.log import Log
@@ -43,13 +44,15 @@ def _of(rows: Sequence[Row], axis: str) -> Iterator[tuple[Effect, list[float], b
 
 def _late_s(effect: Effect, parameters: list[float], t_s: np.ndarray) -> np.ndarray:
     """Return how late readings are: what is missing of one that moves at 1 m/s."""
-    known = {name: np.zeros_like(t_s) for name in effect.quantities} | {"velocity_m_per_s": np.ones_like(t_s)}
-    known |= {"t_s": t_s} if "t_s" in known else {}
-    columns = np.column_stack([known[name] for name in effect.quantities])
-    still = columns.copy()
-    still[:, effect.quantities.index("velocity_m_per_s")] = 0.0
+    if "t_s" not in effect.quantities and t_s.size > 1:
+        return np.full(t_s.size, _late_s(effect, parameters, t_s[:1])[0])
+    columns = np.zeros((t_s.size, len(effect.quantities)))
+    if "t_s" in effect.quantities:
+        columns[:, effect.quantities.index("t_s")] = t_s
     law, values = compose.along(effect), np.array([*parameters, 0.0])
-    return np.asarray(law(still, values, np.zeros(1))) - np.asarray(law(columns, values, np.zeros(1)))
+    still = np.asarray(law(columns, values, np.zeros(1)))
+    columns[:, effect.quantities.index("velocity_m_per_s")] = 1.0
+    return still - np.asarray(law(columns, values, np.zeros(1)))
 
 
 def delay_s(rows: Sequence[Row], axis: str, log: Log) -> np.ndarray:
@@ -113,12 +116,28 @@ def _shifted(force_n: np.ndarray, effect: Effect, parameters: list[float], log: 
     """Return means over parts of intervals of a force that comes later; its ends are held."""
     part_s = log.period_s / force_n.shape[1]
     edges = np.arange(force_n.size + 1, dtype=float)
-    impulse = np.concatenate([[0.0], np.cumsum(force_n.ravel())])
     there = edges - _late_s(effect, parameters, log.start_s + part_s * edges) / part_s
-    inside = np.clip(there, 0.0, edges[-1])
-    beyond = (there - inside) * np.where(there < inside, force_n.flat[0], force_n.flat[-1])
-    moved = np.interp(inside, edges, impulse) + beyond
-    return (np.diff(moved) * np.diff(there)).reshape(force_n.shape)
+    return _means_between(there, force_n.ravel()).reshape(force_n.shape)
+
+
+@compiled
+def _means_between(edges: np.ndarray, force_n: np.ndarray) -> np.ndarray:
+    """Return means over parts of a force on parts whose edges lie elsewhere, times how wide they are; ends are held."""
+    n = force_n.size
+    impulse = np.zeros(n + 1)
+    for k in range(n):
+        impulse[k + 1] = impulse[k] + force_n[k]
+    means = np.empty(n)
+    before = 0.0
+    for k in range(n + 1):
+        inside = min(max(edges[k], 0.0), float(n))
+        low = min(int(inside), n - 1)
+        moved = impulse[low] + (impulse[low + 1] - impulse[low]) * (inside - low)
+        moved += (edges[k] - inside) * (force_n[0] if edges[k] < inside else force_n[n - 1])
+        if k > 0:
+            means[k - 1] = (moved - before) * (edges[k] - edges[k - 1])
+        before = moved
+    return means
 
 
 def motion_now(rows: Sequence[Row], axis: str, log: Log, motion: Motion) -> Motion:
@@ -134,12 +153,20 @@ def motion_now(rows: Sequence[Row], axis: str, log: Log, motion: Motion) -> Moti
         part_s = log.period_s / PARTS_COUNT
         t_s = log.start_s + part_s * (np.arange(x.size) + 0.5)
         late_s = _late_s(effect, parameters, t_s + _late_s(effect, parameters, t_s))
-        there = np.clip(np.arange(x.size) + np.rint(late_s / part_s).astype(int), 0, x.size - 1)
-        rest_s = late_s - part_s * (there - np.arange(x.size))
-        x, v, a = x.ravel()[there], v.ravel()[there], a.ravel()[there]
-        motion = replace(
-            motion,
-            position_m=(x + rest_s * v + 0.5 * rest_s**2 * a).reshape(motion.position_m.shape),
-            velocity_m_per_s=(v + rest_s * a).reshape(motion.position_m.shape),
-        )
+        position_m, rate_m_per_s = _read_later(x.ravel(), v.ravel(), a.ravel(), late_s, part_s)
+        motion = replace(motion, position_m=position_m.reshape(x.shape), velocity_m_per_s=rate_m_per_s.reshape(x.shape))
     return motion
+
+
+@compiled
+def _read_later(
+    x: np.ndarray, v: np.ndarray, a: np.ndarray, late_s: np.ndarray, part_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return position and velocity on parts of intervals, from the motion that is read `late_s` after them."""
+    position_m, rate_m_per_s = np.empty(x.size), np.empty(x.size)
+    for k in range(x.size):
+        there = min(max(k + int(np.rint(late_s[k] / part_s)), 0), x.size - 1)
+        rest_s = late_s[k] - part_s * (there - k)
+        position_m[k] = x[there] + rest_s * v[there] + 0.5 * rest_s**2 * a[there]
+        rate_m_per_s[k] = v[there] + rest_s * a[there]
+    return position_m, rate_m_per_s

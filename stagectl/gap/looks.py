@@ -57,7 +57,7 @@ def looked_closely(
     """
     found = first.judge.select(until=lambda group: moves_joint(first, group))
     look = plain = _of_best_form(Look(first, found, all_named(first, found)), unsettled, crew)
-    known, moved = plain, ()
+    known, moved, before = plain, (), excess(first, [])
     refused: frozenset[tuple[str, str]] = frozenset()
     for _ in range(_CLOSER_LOOKS):
         if not known.chosen and not moved:
@@ -68,6 +68,8 @@ def looked_closely(
         solution = solve([*search.judge.base, *chosen], search.evidence.sums)
         at_size = remeasured(search, solution, known.named, search.moved) if search.moved else ()
         look = Look(search, chosen, at_size + all_named(search, chosen))
+        if search.judge.lacks_a_name(chosen) and unknown_rest(search, chosen, before) is not None:
+            break  # no further look gives it one
         gone = {(one.name, one.acts_on) for one in at_size if not stands(one, search.evidence.recordings[0])}
         if gone:  # at its size it is nothing
             if known.search is not first:
@@ -84,7 +86,6 @@ def looked_closely(
             known, moved = look, moved_now(search, look.chosen)
         else:
             break
-    before = excess(first, [])
     if unknown_rest(look.search, look.chosen, before) and not unknown_rest(first, plain.chosen, before):
         look = plain  # the first look had reached the floor
     return _measured(look)

@@ -137,64 +137,49 @@ def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
 
 
 class Fold:
-    """Groups solved on some recordings and judged on others, ready to say what one more group would gain."""
+    """Groups solved on some recordings, ready to say what one more group would gain there."""
 
-    def __init__(self, groups: Sequence[Group], fitted: Sequence[Sums], judged: Sequence[Sums], on_noise: bool):
-        self._fitted, self._judged, self._on_noise = fitted, judged, on_noise
-        self._slots, precision = active_slots(groups, fitted)
-        self._rights = {id(s): _right(s, on_noise) for s in [*fitted, *judged]}
-        normal = self._cross(self._slots, self._slots, fitted) + np.diag(precision)
+    def __init__(self, groups: Sequence[Group], sums: Sequence[Sums], on_noise: bool):
+        """Eliminate `groups` once; on_noise: in place of the innovations, draws of white noise."""
+        self._sums = sums
+        self._rights = [_right(s, on_noise) for s in sums]
+        self._slots, precision = active_slots(groups, sums)
+        normal = self._cross(self._slots, self._slots) + np.diag(precision)
         scale = np.sqrt(np.diag(normal))
         scale[scale == 0.0] = 1.0
         weights = np.outer(scale, scale)
         self._inverse = np.linalg.inv(normal / weights + _JITTER * np.eye(scale.size)) / weights
-        self._values = self._inverse @ self._seen(self._slots, fitted)
-        self._apart = self._judged_gain(self._slots, self._values)
+        self._values = self._inverse @ self._seen(self._slots)
+        self._everywhere = np.zeros((len(self._slots), sums[0].gram.shape[0]))  # of columns with one amplitude each
+        for s in sums:
+            here = [k for k, (_, scope) in enumerate(self._slots) if covers(scope, s)]
+            self._everywhere[here] += s.gram[[self._slots[k][0] for k in here]]
 
-    def added(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
-        """Return (gain where it is fitted, gain where it is judged) of one group more, one element a right side."""
-        slots, precision = active_slots([group], self._fitted)
-        cross = self._cross(self._slots, slots, self._fitted)
-        back = self._inverse @ cross
-        normal = self._cross(slots, slots, self._fitted) + np.diag(precision) - cross.T @ back
-        right = self._seen(slots, self._fitted) - cross.T @ self._values
+    def added(self, group: Group) -> np.ndarray:
+        """Return the gain of one group more, one element a right side."""
+        slots, precision = active_slots([group], self._sums)
+        columns = list(group.columns)
+        cross = self._everywhere[:, columns] if group.scope == "structural" else self._cross(self._slots, slots)
+        normal = self._cross(slots, slots) + np.diag(precision) - cross.T @ (self._inverse @ cross)
+        right = self._seen(slots) - cross.T @ self._values
         scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
         if not np.all(scale > 0.0):
-            return np.zeros(right.shape[1]), np.zeros(right.shape[1])
+            return np.zeros(right.shape[1])
         weights = np.outer(scale, scale)
         scaled = normal / weights + _JITTER * np.eye(scale.size)
         values = np.linalg.solve(scaled, right / scale[:, None]) / scale[:, None]
-        together = np.vstack([self._values - back @ values, values])
-        gain = 2.0 * np.einsum("ij,ij->j", right, values) - np.einsum("ij,ij->j", values, normal @ values)
-        return gain, self._judged_gain([*self._slots, *slots], together) - self._apart
+        return 2.0 * np.einsum("ij,ij->j", right, values) - np.einsum("ij,ij->j", values, normal @ values)
 
-    def _judged_gain(self, slots: list[tuple[int, str]], values: np.ndarray) -> np.ndarray:
-        fixed = [k for k, (_, scope) in enumerate(slots) if scope == ""]
-        own = sorted({column for column, scope in slots if scope != ""})
-        columns, theta = [slots[k][0] for k in fixed], values[fixed]
-        total = np.zeros(values.shape[1])
-        for s in self._judged:
-            right = self._rights[id(s)]
-            bent = s.gram[np.ix_(columns, columns)] @ theta
-            total += 2.0 * np.einsum("ij,ij->j", theta, right[columns]) - np.einsum("ij,ij->j", theta, bent)
-            if own:
-                rest = right[own] - s.gram[np.ix_(own, columns)] @ theta
-                normal = s.gram[np.ix_(own, own)]
-                normal = normal + (_JITTER * np.trace(normal) + 1e-300) * np.eye(len(own))
-                total += np.einsum("ij,ij->j", rest, np.linalg.solve(normal, rest)) - len(own)
-        return total
-
-    def _seen(self, slots: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
-        total = np.zeros((len(slots), self._rights[id(sums[0])].shape[1]))
-        for s in sums:
+    def _seen(self, slots: list[tuple[int, str]]) -> np.ndarray:
+        total = np.zeros((len(slots), self._rights[0].shape[1]))
+        for s, right in zip(self._sums, self._rights, strict=True):
             here = [k for k, (_, scope) in enumerate(slots) if covers(scope, s)]
-            total[here] += self._rights[id(s)][[slots[k][0] for k in here]]
+            total[here] += right[[slots[k][0] for k in here]]
         return total
 
-    @staticmethod
-    def _cross(a: list[tuple[int, str]], b: list[tuple[int, str]], sums: Sequence[Sums]) -> np.ndarray:
+    def _cross(self, a: list[tuple[int, str]], b: list[tuple[int, str]]) -> np.ndarray:
         total = np.zeros((len(a), len(b)))
-        for s in sums:
+        for s in self._sums:
             rows = [k for k, (_, scope) in enumerate(a) if covers(scope, s)]
             columns = [k for k, (_, scope) in enumerate(b) if covers(scope, s)]
             part = s.gram[np.ix_([a[k][0] for k in rows], [b[k][0] for k in columns])]

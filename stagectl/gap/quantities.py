@@ -1,5 +1,7 @@
 """What a law may ask for at a place of the machine, and a law run along it. Pure."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from stagectl import compose
@@ -11,54 +13,88 @@ from stagectl.gap.recording import Recording, relative_motion
 
 def quantities(recording: Recording, axis: str, place: str) -> dict[str, np.ndarray]:
     """Everything that a law at one place may ask for, on parts of intervals."""
-    kind = "joint" if place == "joint" else "sensor" if place.endswith("_sensor") else "force"
-    key = (axis, kind)
-    if key not in recording.known:
-        recording.known[key] = _quantities(recording, axis, kind)
-    return recording.known[key]
-
-
-def _quantities(recording: Recording, axis: str, kind: str) -> dict[str, np.ndarray]:
-    motion = recording.motion(axis)
-    h = recording.log.period_s
-    whole = np.ones_like(motion.position_m)
-    x_b, x_b_rate = relative_motion(recording) if recording.end is not None else (0.0 * whole, 0.0 * whole)
-    relative_m, relative_m_per_s = -x_b, -x_b_rate
-    motor_n = recording.felt_n[axis]
-    known = {
-        "position_m": relative_m if kind == "joint" else motion.position_m,
-        "velocity_m_per_s": relative_m_per_s if kind == "joint" else motion.velocity_m_per_s,
-        "acceleration_m_per_s2": motion.acceleration_m_per_s2,
-        "relative_position_m": relative_m,
-        "relative_velocity_m_per_s": relative_m_per_s,
-        "motor_force_n": motor_n,
-        "current_a": motor_n / recording.force_constant_n_per_a(axis),
-        "micro_motor_force_n": 0.0 * whole if recording.micro_command_n is None else recording.micro_command_n,
-        "mass_kg": recording.mass_kg(axis) * whole,
-        "t_s": recording.log.start_s
-        + recording.log.times_s[:, None]
-        + (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * h,
-        "dt_s": h / PARTS_COUNT * whole,
-    }
-    if kind == "sensor":  # a reading is of the sample's instant: one column, where all else has parts of intervals
-        known = {name: _at_samples(values) for name, values in known.items()}
-        for place, name in enumerate(("position_m", "velocity_m_per_s", "acceleration_m_per_s2")):
-            known[name] = motion.at_samples[:, place : place + 1]
-        place_m, sd_m = _at_readings(recording, axis)
-        known |= {
-            "position_m": place_m[:, None],
-            "position_sd_m": sd_m[:, None],
-            "t_s": (recording.log.start_s + recording.log.times_s)[:, None],
-            "dt_s": np.full((recording.log.samples_count, 1), h),
-        }
-        return known
-    joint = recording.believed.joint
-    if joint is not None and recording.side is not None:
-        known["penetration_m"] = recording.penetration_m
-        known["penetration_velocity_m_per_s"] = recording.penetration_velocity_m_per_s
-        known["contact_side_ratio"] = recording.side
-        known["contact_stiffness_n_per_m"] = side_stiffness_n_per_m(joint, recording.side)
+    known, made = _known(recording, axis, place)
+    for name, make in made.items():
+        if name not in known:
+            known[name] = make()
     return known
+
+
+def arguments_of(recording: Recording, axis: str, place: str, effect: Effect) -> list[np.ndarray]:
+    """Return what an effect asks for, in its order; nothing else is made: recordings that are late live for one law."""
+    known, made = _known(recording, axis, place)
+    for name in effect.quantities:
+        if name not in known:
+            known[name] = made[name]()
+    return [known[name] for name in effect.quantities]
+
+
+def _known(
+    recording: Recording, axis: str, place: str
+) -> tuple[dict[str, np.ndarray], dict[str, Callable[[], np.ndarray]]]:
+    """Return what is known at one place already, and how all of it is made."""
+    kind = "joint" if place == "joint" else "sensor" if place.endswith("_sensor") else "force"
+    known = recording.known.setdefault((axis, kind), {})
+    if kind != "sensor":
+        return known, _made(recording, axis, kind)
+    if not known:
+        known |= _of_sensor(recording, axis)
+    return known, {}
+
+
+def _made(recording: Recording, axis: str, kind: str) -> dict[str, Callable[[], np.ndarray]]:
+    """Return how everything at a place of forces is made, on parts of intervals."""
+    motion, h = recording.motion(axis), recording.log.period_s
+
+    def all_over(value: float) -> np.ndarray:
+        return np.full_like(motion.position_m, value)
+
+    def apart(which: int) -> np.ndarray:
+        return -relative_motion(recording)[which] if recording.end is not None else all_over(0.0)
+
+    def times_s() -> np.ndarray:
+        middles_s = (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * h
+        return recording.log.start_s + recording.log.times_s[:, None] + middles_s
+
+    motor_n, micro_n = recording.felt_n[axis], recording.micro_command_n
+    made: dict[str, Callable[[], np.ndarray]] = {
+        "position_m": lambda: apart(0) if kind == "joint" else motion.position_m,
+        "velocity_m_per_s": lambda: apart(1) if kind == "joint" else motion.velocity_m_per_s,
+        "acceleration_m_per_s2": lambda: motion.acceleration_m_per_s2,
+        "relative_position_m": lambda: apart(0),
+        "relative_velocity_m_per_s": lambda: apart(1),
+        "motor_force_n": lambda: motor_n,
+        "current_a": lambda: motor_n / recording.force_constant_n_per_a(axis),
+        "micro_motor_force_n": lambda: all_over(0.0) if micro_n is None else micro_n,
+        "mass_kg": lambda: all_over(recording.mass_kg(axis)),
+        "t_s": times_s,
+        "dt_s": lambda: all_over(h / PARTS_COUNT),
+    }
+    joint, side = recording.believed.joint, recording.side
+    depth_m, rate_m_per_s = recording.penetration_m, recording.penetration_velocity_m_per_s
+    if joint is not None and side is not None and depth_m is not None and rate_m_per_s is not None:
+        made |= {
+            "penetration_m": lambda: depth_m,
+            "penetration_velocity_m_per_s": lambda: rate_m_per_s,
+            "contact_side_ratio": lambda: side,
+            "contact_stiffness_n_per_m": lambda: side_stiffness_n_per_m(joint, side),
+        }
+    return made
+
+
+def _of_sensor(recording: Recording, axis: str) -> dict[str, np.ndarray]:
+    """Return everything at a sensor. A reading is of the sample's instant: one column, not parts of intervals."""
+    motion, log = recording.motion(axis), recording.log
+    known = {name: _at_samples(make()) for name, make in _made(recording, axis, "sensor").items()}
+    for place, name in enumerate(("position_m", "velocity_m_per_s", "acceleration_m_per_s2")):
+        known[name] = motion.at_samples[:, place : place + 1]
+    place_m, sd_m = _at_readings(recording, axis)
+    return known | {
+        "position_m": place_m[:, None],
+        "position_sd_m": sd_m[:, None],
+        "t_s": (log.start_s + log.times_s)[:, None],
+        "dt_s": np.full((log.samples_count, 1), log.period_s),
+    }
 
 
 _MOVED_NOISES = 10.0
@@ -91,7 +127,8 @@ def _at_samples(fine: np.ndarray) -> np.ndarray:
 
 def along_motion(effect: Effect, arguments: list[np.ndarray], parameters: list[float]) -> np.ndarray:
     """Run a law in time order over arrays of its quantities, all of shape (n, parts); shape kept."""
-    columns = np.column_stack([np.ascontiguousarray(values).ravel() for values in arguments])
+    flat = [np.ascontiguousarray(values).ravel() for values in arguments]
+    columns = flat[0][:, None] if len(flat) == 1 else np.column_stack(flat)
     memory = np.zeros(max(effect.memory, 1))
     out = compose.along(effect)(columns, np.array([*parameters, 0.0]), memory)
     return np.asarray(out).reshape(arguments[0].shape)

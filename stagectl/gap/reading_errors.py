@@ -7,7 +7,7 @@ from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.contact import contact_at
 from stagectl.gap.forces import Forces
 from stagectl.gap.quantities import along_motion, quantities
-from stagectl.gap.recording import Recording, contact_of, relative_motion
+from stagectl.gap.recording import Recording, contact_push_n, relative_motion
 
 _READING_PASSES = 2
 
@@ -99,4 +99,4 @@ def more_contact_n(
     there = contact_at(
         joint, damping, x_b + apart_m, x_b_rate + apart_m_per_s, part_s, left_m + left_out_m, right_m + right_out_m
     )
-    return there.push_n(joint, damping) - contact_of(recording).push_n(joint, damping)
+    return there.push_n(joint, damping) - contact_push_n(recording, damping)

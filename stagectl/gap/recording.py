@@ -45,6 +45,9 @@ class Recording:
     edges_out_m: EdgesOut = (0.0, 0.0)
     found: Forces = field(default_factory=Forces)  # of effects that were found, of which none is part of the above
     exchanged: dict[str, Forces] = field(default_factory=dict)  # without what is late of one sensor, once asked for
+    others_n: dict[str, np.ndarray] = field(default_factory=dict)  # on a body, without what swings, once asked for
+    pushed_n: dict[float, np.ndarray] = field(default_factory=dict)  # by the contact, by damping, once asked for
+    apart: tuple[np.ndarray, np.ndarray] | None = None  # macro minus end at one instant, and its rate
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -126,7 +129,7 @@ def put_together(
 
 def with_late(recording: Recording, late: tuple[Row, ...]) -> Recording:
     """Return it with other effects that make readings late; motions and what the motors do stay."""
-    there = replace(recording, late=late, known={}, exchanged={}, felt_n={}, now={})
+    there = replace(recording, late=late, known={}, exchanged={}, felt_n={}, now={}, others_n={}, pushed_n={})
     _read(there)
     return there
 
@@ -140,6 +143,9 @@ def _read(recording: Recording) -> None:
             command_n, motor_n = log.micro_command_n, recording.micro_command_n
         recording.felt_n[axis] = _felt_n(late, axis, log, command_n, recording.belief(axis), motor_n)
         recording.now[axis] = late_readings.motion_now(late, axis, log, recording.motion(axis))
+    if recording.end is not None:
+        macro, end = recording.now["macro"], recording.now["end"]
+        recording.apart = macro.position_m - end.position_m, macro.velocity_m_per_s - end.velocity_m_per_s
     if recording.end is not None and believed.joint is not None:
         part_s = log.period_s / recording.now["end"].position_m.shape[1]
         contact = contact_at(
@@ -157,6 +163,16 @@ def contact_of(recording: Recording) -> Contact:
     return Contact(side, depth_m, rate)
 
 
+def contact_push_n(recording: Recording, damping_n_s_per_m: float) -> np.ndarray:
+    """Return the force of the believed contact on the end with a damping of its own, shape (n, parts)."""
+    joint = recording.believed.joint
+    if joint is None:
+        raise KeyError("joint")
+    if damping_n_s_per_m not in recording.pushed_n:
+        recording.pushed_n[damping_n_s_per_m] = contact_of(recording).push_n(joint, damping_n_s_per_m)
+    return recording.pushed_n[damping_n_s_per_m]
+
+
 def _felt_n(
     late: tuple[Row, ...], axis: str, log: Log, command_n: np.ndarray, belief: BelievedAxis, motor_n: np.ndarray
 ) -> np.ndarray:
@@ -168,5 +184,6 @@ def _felt_n(
 
 def relative_motion(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Return x_b = macro minus end at one instant, on parts of intervals, and its rate."""
-    macro, end = recording.now["macro"], recording.now["end"]
-    return macro.position_m - end.position_m, macro.velocity_m_per_s - end.velocity_m_per_s
+    if recording.apart is None:
+        raise KeyError("end")
+    return recording.apart

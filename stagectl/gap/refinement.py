@@ -229,7 +229,9 @@ class Refiner:
             columns = (columns_of or self._evidence.columns_of)(term)
         except (FloatingPointError, ValueError):
             return -_WORST
-        if any(part is not None and not np.max(np.abs(part)) < _LARGEST for parts in columns for part in parts):
+        if any(
+            part is not None and not -_LARGEST < part.min() <= part.max() < _LARGEST for one in columns for part in one
+        ):
             return -_WORST  # a shape at which a law runs away
         normal, right = self._reduced(columns, term)
         if not term.linear:

@@ -27,6 +27,10 @@ EXACT_RATIO = 0.0005
 CURVE_GAIN = 3.0
 """Of what the best of the library gains on noise, what a curve has to gain to be a rest that something has left."""
 
+NAMES_BESIDE_CURVE_COUNT = 3
+"""From so many names on a curve that explains more than any further name ends the search: it is unknown. To six names
+and back, each competing beside the others again, took a force that no effect is a quarter of an hour or more."""
+
 SEARCH_PRICE = 2.0
 """What a shape that is searched beyond the grid gains on noise, at most about (chi square of one number)."""
 
@@ -141,10 +145,10 @@ class Judge:
 
     def calibrate(self) -> None:
         """Set the threshold: the quantile of the best gain of the whole library on noise."""
-        fold = Fold(self.base, self.source.sums, self.source.sums, on_noise=True)
+        fold = Fold(self.base, self.source.sums, on_noise=True)
         best = np.zeros(self.source.sums[0].nulls.shape[0])
         for group in self.library:
-            best = np.maximum(best, fold.added(group)[0])
+            best = np.maximum(best, fold.added(group))
         self.threshold = float(np.quantile(best, NULL_QUANTILE))
 
     def reducible(self, groups: Sequence[Group]) -> tuple[float, float]:
@@ -171,12 +175,16 @@ class Judge:
     ) -> list[Group]:
         """Add the best hypothesis as long as one stays; then let every one compete again beside the others.
 
-        Ends early with a hypothesis of which `until` says that everything has to be looked at anew.
+        Ends early with a hypothesis of which `until` says that everything has to be looked at anew, and where what is
+        left lacks a name.
         """
         chosen = self._admissible(start)
         seen: set[frozenset[tuple[str, str]]] = set()
         while len(chosen) < most:
             rivals = self.rivals(chosen)
+            if self.lacks_a_name(chosen):
+                self._note(chosen, rivals)
+                break
             passing = [group for group in rivals if self._stays(chosen, group) and self._allowed([*chosen, group])]
             self._note(chosen, rivals)
             more = [self._simplest(chosen, passing)] if passing else self._pair(chosen, rivals)
@@ -246,12 +254,12 @@ class Judge:
     def _ranked(self, chosen: Sequence[Group], most: int) -> list[Group]:
         """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
         beside = [*self.base, *chosen]
-        fold = Fold(beside, self.source.sums, self.source.sums, on_noise=False)
+        fold = Fold(beside, self.source.sums, on_noise=False)
         by_name: dict[tuple[str, str], list[tuple[float, Group]]] = {}
         taken = {group.key for group in chosen}
         open_ones = [group for group in self.library if group.key not in taken]
         for group, at_size in zip(open_ones, self.gains_at_size(beside, open_ones), strict=True):
-            gain = max(float(fold.added(group)[0][0]), at_size)
+            gain = max(float(fold.added(group)[0]), at_size)
             shapes = by_name.setdefault(group.key, [])
             shapes.append((gain - self.price() * group.complexity, group))
             shapes.sort(key=lambda row: -row[0])
@@ -337,6 +345,19 @@ class Judge:
         """Tell whether a table over position, velocity or time still finds something."""
         now = self.gain(chosen)
         return any(self.gain([*chosen, curve]) - now > CURVE_GAIN * self.threshold for curve in self.curves)
+
+    def lacks_a_name(self, chosen: Sequence[Group]) -> bool:
+        """Tell whether beside some names already a curve explains more than any further name: what is left has none.
+
+        Beside one or two, the curve may be of two effects that follow the same quantity.
+        """
+        if len(chosen) < NAMES_BESIDE_CURVE_COUNT:
+            return False
+        now = self.gain(chosen)
+        left = sum(float(s.gram[0, 0]) - s.count for s in self.source.sums) - self.gain([])
+        least = max(CURVE_GAIN * self.threshold, MATERIAL_RATIO * max(left, 0.0))
+        named = max((self.gain([*chosen, group]) - now for group in self.rivals(chosen)), default=0.0)
+        return any(self.gain([*chosen, curve]) - now > max(least, named) for curve in self.curves)
 
     def _foretells(self, chosen: Sequence[Group], more: Sequence[Group]) -> bool:
         """Tell whether held-out recordings do not speak against what comes on top.
