@@ -202,6 +202,23 @@ def test_what_training_leaves_open_does_not_speak_against_the_truth():
     assert {group.key[0] for group in judge.select()} == {"one", "other"}
 
 
+@pytest.mark.parametrize(("training", "runs"), [(2, 3), (3, 3)])
+def test_what_training_leaves_open_is_not_foretold_of_recordings_that_no_fit_saw(training, runs):
+    """An error of a reading, by a soft spring to a tenth of the noise, and by a contact to a thousand times that."""
+
+    def draw(run, random):
+        clear, faint = random.standard_normal(4000), random.standard_normal(4000)
+        seen = (1e3 if run == 2 else 1.0) * faint
+        return [random.standard_normal(4000) + 0.5 * clear + 1e-3 * seen, clear, seen]
+
+    both = [Group((name, "macro_force"), (column,)) for name, column in (("clear", 1), ("faint", 2))]
+    judge = _table_judge(draw, both, training=training, runs=runs)
+    before, after = judge.reducible([])[1], judge.reducible(both)[1]
+    touching = 4000.0  # what the contact alone shows: nobody can foretell it
+    assert before - after == pytest.approx(0.25 * 4000 * (1 if training == 2 else 3), rel=0.15)
+    assert after == pytest.approx(touching, rel=0.15)
+
+
 def test_two_that_only_stand_together_are_found():
     """What one recording shows the sum of and another both of: each alone is a compromise that both speak against."""
 
@@ -318,9 +335,9 @@ def test_one_elimination_gives_what_solving_anew_gives():
     judge = _judge(0.3)
     start = [judge.library[0]]
     before = judge.gain(start)
-    fold = Fold([*judge.base, *start], judge.training, judge.training, on_noise=False)
+    fold = Fold([*judge.base, *start], judge.training, on_noise=False)
     for group in judge.library[1:]:
-        assert fold.added(group)[0][0] == pytest.approx(judge.gain([*start, group]) - before, abs=1e-5)
+        assert fold.added(group)[0] == pytest.approx(judge.gain([*start, group]) - before, abs=1e-5)
 
 
 @functools.cache

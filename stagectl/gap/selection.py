@@ -141,10 +141,10 @@ class Judge:
 
     def calibrate(self) -> None:
         """Set the threshold: the quantile of the best gain of the whole library on noise."""
-        fold = Fold(self.base, self.source.sums, self.source.sums, on_noise=True)
+        fold = Fold(self.base, self.source.sums, on_noise=True)
         best = np.zeros(self.source.sums[0].nulls.shape[0])
         for group in self.library:
-            best = np.maximum(best, fold.added(group)[0])
+            best = np.maximum(best, fold.added(group))
         self.threshold = float(np.quantile(best, NULL_QUANTILE))
 
     def reducible(self, groups: Sequence[Group]) -> tuple[float, float]:
@@ -246,12 +246,12 @@ class Judge:
     def _ranked(self, chosen: Sequence[Group], most: int) -> list[Group]:
         """Rank names by what they gain on all recordings, as columns or at their size, and search their shapes."""
         beside = [*self.base, *chosen]
-        fold = Fold(beside, self.source.sums, self.source.sums, on_noise=False)
+        fold = Fold(beside, self.source.sums, on_noise=False)
         by_name: dict[tuple[str, str], list[tuple[float, Group]]] = {}
         taken = {group.key for group in chosen}
         open_ones = [group for group in self.library if group.key not in taken]
         for group, at_size in zip(open_ones, self.gains_at_size(beside, open_ones), strict=True):
-            gain = max(float(fold.added(group)[0][0]), at_size)
+            gain = max(float(fold.added(group)[0]), at_size)
             shapes = by_name.setdefault(group.key, [])
             shapes.append((gain - self.price() * group.complexity, group))
             shapes.sort(key=lambda row: -row[0])
