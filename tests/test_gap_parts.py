@@ -274,6 +274,23 @@ def test_what_rises_on_a_level_is_reshaped_with_the_level():
     assert judge.select() == [rise, level]
 
 
+@pytest.mark.parametrize(
+    ("slip", "names"), [(0.0, {"coulomb_friction", "stribeck_friction"}), (0.1, {"lugre_friction"})]
+)
+def test_bristles_that_slip_by_nothing_are_a_level_and_a_rise(slip, names):
+    """Alone the level gains less than the bristles, and beside them nothing; what they slip by makes them one law."""
+
+    def draw(run, random):
+        level, rise, rest = (random.standard_normal(4000) for _ in range(3))
+        bristles = 5.0 * level + 3.0 * rise + slip * rest
+        return [random.standard_normal(4000) + bristles, level, rise, bristles]
+
+    place = "macro_force"
+    level, rise = Group(("coulomb_friction", place), (1,)), Group(("stribeck_friction", place), (2,), searched=1)
+    judge = _table_judge(draw, [level, rise, Group(("lugre_friction", place), (3,), searched=3)])
+    assert {group.key[0] for group in judge.select()} == names
+
+
 def test_a_law_that_loses_by_more_than_is_left_is_none_that_inexact_laws_excuse():
     """4000 squares apart, of 10 million that both gain, with 360 left: the other one leaves 1960."""
 

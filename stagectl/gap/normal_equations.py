@@ -138,8 +138,9 @@ def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
     return total
 
 
-OPEN_SDS = 3.0
-"""Deviations below which a sum of amplitudes is as good as open: what noise makes of nothing once in 370."""
+OPEN_SDS = 5.0
+"""Deviations below which a sum of amplitudes is as good as open: above, it foretells more than it spoils even where it
+is 2.5 of them off."""
 
 
 def _foretelling(solution: Solution, fixed: Sequence[int], elsewhere: np.ndarray) -> np.ndarray:

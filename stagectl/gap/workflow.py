@@ -21,6 +21,7 @@ from stagectl.gap.naming import (
     parameter_errors,
     refitted_errors,
     second_pitches,
+    spoken_against,
     without_widths,
 )
 from stagectl.gap.noise import noise_of
@@ -131,7 +132,7 @@ def _found(
         reducible_before=before,
         reducible_after=look.search.judge.reducible(look.chosen),
         threshold=judge.threshold,
-        remarks=(*remarks, *(remark for log in logs for remark in log.remarks)),
+        remarks=(*remarks, *spoken_against(named), *(remark for log in logs for remark in log.remarks)),
         trace=tuple(judge.trace),
         refitted_sds={name: sd for name, (_, sd) in refitted.items()},
         profile_path=believed.path,
