@@ -20,8 +20,9 @@ from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
-from stagectl.gap.selection import ALIAS_GAIN
+from stagectl.gap.selection import ALIAS_GAIN, Judge
 from stagectl.gap.settling import (
+    belief_under,
     is_taken_at_size,
     left_at_size,
     moved_by,
@@ -42,6 +43,7 @@ class Look(NamedTuple):
     chosen: list[Group]
     named: tuple[Named, ...]
     solution: Solution | None = None
+    belief: Judge | None = None  # of what the belief leaves, in units of this look's noise
 
 
 def looked_closely(
@@ -84,10 +86,12 @@ def looked_closely(
             known, moved = look, moved_now(search, look.chosen)
         else:
             break
-    before = excess(first, [])
-    if unknown_rest(look.search, look.chosen, before) and not unknown_rest(first, plain.chosen, before):
-        look = plain  # the first look had reached the floor
-    return _measured(look)
+    belief = belief_under(first, look.search, crew)
+    if unknown_rest(look.search, look.chosen, excess(belief, [])) and not unknown_rest(
+        first, plain.chosen, excess(first.judge, [])
+    ):
+        look, belief = plain, first.judge  # the first look had reached the floor
+    return _measured(look)._replace(belief=belief)
 
 
 _ALONG_ITSELF = frozenset({Trait.FIRST_ORDER, Trait.SWINGS})
