@@ -408,6 +408,11 @@ def test_memory_and_declaration_agree():
         """Wrong."""
         return contact_side_ratio * memory[0]
 
+    def slow(command_a, current_loop_s):
+        """Wrong."""
+        return -command_a * current_loop_s
+
+    assert "is no law without memory" in refused(slow, places=("macro_command",))
     assert "memory = 1 in the decorator, and the law does not take" in refused(forgetful, memory=1)
     assert "memory = 0 in the decorator, and the law takes" in refused(timeless)
     assert "advances it by dt_s" in refused(timeless, memory=1)
