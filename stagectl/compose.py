@@ -56,8 +56,8 @@ def substep(state, parameters, effect_parameters, dt_s, macro_command_a, micro_c
     q = parameters[0]
     p = effect_parameters
     memory = s.memory
-    macro_command_a += macro_command(macro_command_a, s.t_s, dt_s, memory, p)
-    micro_command_a += micro_command(micro_command_a, s.t_s, dt_s, memory, p)
+    macro_command_a += macro_command(macro_command_a, q.macro_current_loop_s, s.t_s, dt_s, memory, p)
+    micro_command_a += micro_command(micro_command_a, q.micro_current_loop_s, s.t_s, dt_s, memory, p)
     s.left_edge_shift_m = contact_edge(-1.0, s.t_s, memory, p)
     s.right_edge_shift_m = contact_edge(1.0, s.t_s, memory, p)
     plant.half_step(s, q, dt_s, macro_command_a, micro_command_a, macro_bridge, micro_bridge)
@@ -173,7 +173,7 @@ def _forces_source(structure: tuple[tuple[str, str], ...]) -> str:
         lines += ["", "", "@inlined", f"def {place}_lost(wanted_a, t_s, dt_s, memory, p):", "    lost_a = 0.0"]
         if body:  # the command that makes up for its own loss: a fixed point, that of a dead band d above d / 1000
             lines += ["    for _ in range(10):"]
-            lines += [f"        lost_a = {place}_at_once(wanted_a - lost_a, t_s, dt_s, memory, p)"]
+            lines += [f"        lost_a = {place}_at_once(wanted_a - lost_a, 0.0, t_s, dt_s, memory, p)"]
         lines += ["    return lost_a"]
     return "\n".join(lines) + "\n"
 
@@ -243,7 +243,7 @@ def command_lag_s(effects: Iterable[Mapping[str, Any]], place: str) -> float:
     for row in _check(effects):
         known = CATALOGUE[row["name"]]
         if row["acts_on"] == place and known.memory:
-            given = {"command_a": 1.0, "dt_s": _STEP_S}
+            given = {"command_a": 1.0, "current_loop_s": 0.0, "dt_s": _STEP_S}
             rows = np.array([[(given | {"t_s": k * _STEP_S})[key] for key in known.quantities] for k in range(_STEPS)])
             values = np.array([float(row[key]) for key in known.parameters])
             lost_s -= _STEP_S * float(np.sum(along(known)(rows, values, np.zeros(known.memory))))

@@ -120,8 +120,10 @@ WORKED: dict[str, list[Case]] = {
     "amplifier_dead_band": [Case((0.05, 0.02), -0.02), Case((0.01, 0.02), -0.01), Case((-1.0, 0.02), 0.02)],
     # a step seen for one time constant: 1 - 1/e is reached, on average as much is missing
     "current_loop_lag": [
-        Case((1.0, 1e-3, 1e-3), -GONE, (0.0,), (GONE,)),
-        Case((1.0, 0.0, 1e-3), -0.75, (0.25,), (0.25,)),
+        Case((1.0, 0.0, 1e-3, 1e-3), -GONE, (0.0,), (GONE,)),
+        Case((1.0, 0.0, 0.0, 1e-3), -0.75, (0.25,), (0.25,)),
+        # of a loop of 0.25 ms that has 0.75 ms more: the whole fades with 1 ms, and 3/4 of it is what is added
+        Case((1.0, 0.25e-3, 1e-3, 0.75e-3), -0.75 * GONE, (0.0,), (GONE,)),
     ],
     # at t = 0.2 ms, 0.25 ms behind a step of 2 A at t = 0: half of the next 0.1 ms is still without it
     "command_delay": [
@@ -246,6 +248,7 @@ def motion(rows: int = 3000, dt_s: float = 1e-3) -> dict[str, np.ndarray]:
         "contact_stiffness_n_per_m": np.where(side > 0.0, 9.87e3, 13.2e3),
         "contact_side_ratio": side,
         "command_a": np.round(20.0 * np.cos(7.0 * w * t_s)) / 20.0,
+        "current_loop_s": np.full(rows, 0.15e-3),
         "t_s": t_s,
         "dt_s": np.full(rows, dt_s),
     }

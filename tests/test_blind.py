@@ -471,6 +471,17 @@ def test_no_size_tells_a_law_from_itself(touching, monkeypatch, name, acts_on, v
     assert evidence.distances(signal)[name, acts_on] < 0.05 * whole
 
 
+def test_a_scale_error_of_tens_of_micrometres_is_one_of_either_sensor(touching, monkeypatch):
+    """What the joint feels of both is the same, to a thousandth of the gap; 800 ppm ask for 742."""
+    law = laws.BY_NAME["scale_error"]
+    evidence = detection.Evidence(touching, draw.simulate(touching, []), 150.0)
+    of_end = [evidence.law_channels(run, law, "end_sensor", {"relative": -946e-6}) for run in evidence.runs]
+    signal = evidence.whitened(of_end)
+    monkeypatch.setattr(detection.laws, "LIBRARY", [law])
+    whole = math.sqrt(evidence.inner(signal, signal))
+    assert evidence.distances(signal)["scale_error", "macro_sensor"] < 0.05 * whole
+
+
 def test_a_lag_is_told_from_the_delay_that_is_nearest(monkeypatch):
     """Of 78 us, in contact: a delay of 50 us asks for 56, and 200 us for 63."""
     case = generate.draw(2238, None, 20.0)

@@ -6,7 +6,7 @@ import pytest
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance
 from stagectl.gap.believed import Believed, BelievedAxis
-from stagectl.gap.command_path import PARTS_COUNT, changed_by, driven
+from stagectl.gap.command_path import PARTS_COUNT, behind, changed_by, driven
 from stagectl.gap.hypotheses import deviation_term, parameter_terms
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
@@ -39,12 +39,21 @@ def test_a_delay_is_a_command_that_is_taken_over_later(latch_s, lag_s, delay_s):
 
 @pytest.mark.parametrize(("latch_s", "lag_s"), [drive for drive in DRIVES if drive[1] > 0.0])
 @pytest.mark.parametrize("constant_s", [0.2e-3, 2e-3, 20e-3])
-def test_a_lag_before_the_current_loop_by_partial_fractions(latch_s, lag_s, constant_s):
+def test_a_slower_current_loop_is_one_lag_as_long_as_both(latch_s, lag_s, constant_s):
+    both, stated = (driven(COMMAND, latch_s, lag, PERIOD_S) for lag in (lag_s + constant_s, lag_s))
+    wanted = [row - b for row, b in zip(both, stated, strict=True)]
+    found = changed_by(CATALOGUE["current_loop_lag"], [constant_s], COMMAND, latch_s, lag_s, PERIOD_S)
+    assert near([part[100:] for part in found], [part[100:] for part in wanted], 1e-3)
+
+
+@pytest.mark.parametrize(("latch_s", "lag_s"), [drive for drive in DRIVES if drive[1] > 0.0])
+@pytest.mark.parametrize("constant_s", [0.2e-3, 2e-3, 20e-3])
+def test_a_lag_behind_the_current_loop_by_partial_fractions(latch_s, lag_s, constant_s):
     """Two first-order lags a and b in a row answer a step as (a A - b B) / (a - b), A and B the answers of each."""
     slow, fast = (driven(COMMAND, latch_s, lag, PERIOD_S) for lag in (constant_s, lag_s))
     both = [(constant_s * a - lag_s * b) / (constant_s - lag_s) for a, b in zip(slow, fast, strict=True)]
     wanted = [row - b for row, b in zip(both, fast, strict=True)]
-    found = changed_by(CATALOGUE["current_loop_lag"], [constant_s], COMMAND, latch_s, lag_s, PERIOD_S)
+    found = behind(constant_s, COMMAND, latch_s, lag_s, PERIOD_S)
     assert near([part[100:] for part in found], [part[100:] for part in wanted], 1e-3)
 
 

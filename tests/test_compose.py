@@ -92,8 +92,8 @@ def test_the_other_places_sum_their_own_effects():
     assert forces.joint(2e-3, 0.0, 0.0, 0.0, nothing, p) == pytest.approx(-1.0, rel=1e-15)
     assert forces.contact_edge(1.0, 0.0, nothing, p) == pytest.approx(3e-6, rel=1e-15)
     assert forces.contact_edge(-1.0, 0.0, nothing, p) == pytest.approx(1e-6, rel=1e-15)
-    assert forces.micro_command(0.05, 0.0, 1e-4, nothing, p) == pytest.approx(-0.02, rel=1e-15)
-    assert forces.macro_command(0.05, 0.0, 1e-4, nothing, p) == 0.0
+    assert forces.micro_command(0.05, 0.0, 0.0, 1e-4, nothing, p) == pytest.approx(-0.02, rel=1e-15)
+    assert forces.macro_command(0.05, 0.0, 0.0, 1e-4, nothing, p) == 0.0
     assert forces.macro_sensor(0.3, 0.0, 0.0, 0.0, 0.0, nothing, p) == pytest.approx(6e-7, rel=1e-15)
     assert forces.end_sensor(0.3, 0.0, 0.0, 0.0, 0.0, nothing, p) == pytest.approx(-3e-7, rel=1e-15)
 
@@ -119,10 +119,10 @@ def test_a_law_can_undo_what_acts_at_once():
     effects = [table("command_delay", "macro_command"), table("amplifier_dead_band", "macro_command", half_width_a=0.1)]
     forces = compose.forces_module(compose.structure_of(effects))
     p, memory = compose.effect_parameters(effects), np.zeros(MEMORY_COUNT)
-    assert forces.macro_command(1.0, 0.0, 1e-4, memory, p) == pytest.approx(-1.1, rel=1e-12)
+    assert forces.macro_command(1.0, 0.0, 0.0, 1e-4, memory, p) == pytest.approx(-1.1, rel=1e-12)
     assert memory[1] == 1.0  # one change is on its way
     before = memory.copy()
-    assert forces.macro_command_at_once(1.0, 0.0, 1e-4, memory, p) == pytest.approx(-0.1, rel=1e-15)
+    assert forces.macro_command_at_once(1.0, 0.0, 0.0, 1e-4, memory, p) == pytest.approx(-0.1, rel=1e-15)
     assert memory.tobytes() == before.tobytes()
 
 

@@ -183,7 +183,7 @@ def test_a_memory_is_bounded_for_any_step(moves, name):
     t_s = 0.0
     for value, dt_s in moves:
         given_values = {"velocity_m_per_s": value, "acceleration_m_per_s2": value, "command_a": value, "mass_kg": 1.0}
-        given_values |= {"dt_s": dt_s, "t_s": t_s}
+        given_values |= {"dt_s": dt_s, "t_s": t_s, "current_loop_s": 0.15e-3}
         given_values |= {"penetration_m": 1e-5, "penetration_velocity_m_per_s": value, "contact_stiffness_n_per_m": 1e4}
         known.compiled_law(*[given_values[key] for key in known.quantities], *PARAMETERS[name], memory)
         t_s += dt_s
@@ -408,6 +408,11 @@ def test_memory_and_declaration_agree():
         """Wrong."""
         return contact_side_ratio * memory[0]
 
+    def slow(command_a, current_loop_s):
+        """Wrong."""
+        return -command_a * current_loop_s
+
+    assert "is no law without memory" in refused(slow, places=("macro_command",))
     assert "memory = 1 in the decorator, and the law does not take" in refused(forgetful, memory=1)
     assert "memory = 0 in the decorator, and the law takes" in refused(timeless)
     assert "advances it by dt_s" in refused(timeless, memory=1)

@@ -11,10 +11,13 @@ from stagectl.effects import CATALOGUE
 from tests.test_effects import along
 
 
-def passed(name: str, command_a: np.ndarray, dt_s: float, *parameters: float) -> np.ndarray:
-    """Return what the drive makes of a command, a mean a step."""
+def passed(
+    name: str, command_a: np.ndarray, dt_s: float, *parameters: float, current_loop_s: float = 0.0
+) -> np.ndarray:
+    """Return what goes into a drive's current loop for a command, a mean a step."""
     rows = command_a.size
     quantities = {"command_a": command_a, "t_s": dt_s * np.arange(rows), "dt_s": np.full(rows, dt_s)}
+    quantities["current_loop_s"] = np.full(rows, current_loop_s)
     return command_a + along(name, parameters, quantities)
 
 
@@ -47,9 +50,11 @@ def test_lag_follows_a_step_with_its_time_constant():
     assert found[999] == pytest.approx(1.0 - math.exp(-0.9995), rel=1e-6)  # the mean over the thousandth microsecond
 
 
-def test_a_ramp_comes_as_much_later_as_the_time_constant():
+@pytest.mark.parametrize("current_loop_s", [0.0, 1e-3])
+def test_a_ramp_comes_as_much_later_as_the_time_constant(current_loop_s):
+    """Into the loop; what that adds itself comes on top."""
     ramp = 1e-3 * np.arange(20000)
-    found = passed("current_loop_lag", ramp, 50e-6, 2e-3)
+    found = passed("current_loop_lag", ramp, 50e-6, 2e-3, current_loop_s=current_loop_s)
     # 40 steps, less half a step: the command is held over each
     assert ramp[-1] - found[-1] == pytest.approx(40e-3, rel=0.02)
 

@@ -9,21 +9,21 @@ from typing import Any
 import pytest
 
 from bench.blind_sets import load_set
-from stagectl.gap.findings import Named
+from stagectl.gap.findings import Findings
 from stagectl.gap.workflow import find
 from tests.blind import generate
 
 RUNS_COUNT = 2
 
 
-def _found(seed: int, duration_s: float, folder: Path) -> tuple[Named, dict[str, Any]]:
-    """Return the one name that is found in a set, and the one effect that is hidden there."""
+def _found(seed: int, duration_s: float, folder: Path) -> tuple[Findings, dict[str, Any]]:
+    """Return the findings of a set with one name, and the one effect that is hidden there."""
     case = generate.draw(seed, None, duration_s)
     generate.write(case, folder)
     blind = load_set(folder)
-    (named,) = find(blind.believed, list(blind.logs)[:RUNS_COUNT], [], nulls_count=20).named
+    findings = find(blind.believed, list(blind.logs)[:RUNS_COUNT], [], nulls_count=20)
     (hidden,) = generate.truth(case)["effects"]
-    return named, hidden
+    return findings, hidden
 
 
 def test_a_force_that_no_effect_is_ends_the_search_at_three_names(tmp_path):
@@ -41,18 +41,22 @@ def test_a_force_that_no_effect_is_ends_the_search_at_three_names(tmp_path):
 
 def test_a_cyclic_error_has_its_size_along_readings_without_it(tmp_path):
     """Along what the past foretells, which such an error spoils by 0.1 um, 17.9 nm were 1.9 nm."""
-    named, effect = _found(2119, 5.0, tmp_path)
+    findings, effect = _found(2119, 5.0, tmp_path)
+    (named,) = findings.named
     hidden = effect["parameters"]
     assert (named.name, named.acts_on) == (effect["name"], effect["acts_on"])
     size, sd = named.parameters["first_m of session 0"], named.sds["first_m of session 0"]
     assert sd < 0.01 * hidden["amplitude_m"]
     assert size == pytest.approx(hidden["amplitude_m"], abs=3.0 * sd)
     assert named.parameters["second_m of session 0"] < 3.0 * named.sds["second_m of session 0"]
+    # what it explains was a gap before: above the sensor's noise, and not above what it was taken for
+    assert findings.reducible_before[0] - findings.reducible_after[0] == pytest.approx(named.gain, rel=0.1)
 
 
 def test_a_delay_and_a_lag_that_leave_the_same_are_one_set(tmp_path):
     """0.17 ms of one or the other are 1.4 deviations apart; each above a noise of its own, they seemed to be three."""
-    found, hidden = _found(2122, 6.0, tmp_path)
+    findings, hidden = _found(2122, 6.0, tmp_path)
+    (found,) = findings.named
     late = {("sensor_delay", "macro_sensor"), ("sensor_lag", "macro_sensor")}
     assert {(found.name, found.acts_on), *(alias[:2] for alias in found.aliases)} == late
     size = "delay_s" if found.name == "sensor_delay" else "time_constant_s"

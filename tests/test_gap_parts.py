@@ -206,6 +206,23 @@ def test_what_training_leaves_open_does_not_speak_against_the_truth():
     assert {group.key[0] for group in judge.select()} == {"one", "other"}
 
 
+@pytest.mark.parametrize(("training", "runs"), [(2, 3), (3, 3)])
+def test_what_training_leaves_open_is_not_foretold_of_recordings_that_no_fit_saw(training, runs):
+    """An error of a reading, by a soft spring to a tenth of the noise, and by a contact to a thousand times that."""
+
+    def draw(run, random):
+        clear, faint = random.standard_normal(4000), random.standard_normal(4000)
+        seen = (1e3 if run == 2 else 1.0) * faint
+        return [random.standard_normal(4000) + 0.5 * clear + 1e-3 * seen, clear, seen]
+
+    both = [Group((name, "macro_force"), (column,)) for name, column in (("clear", 1), ("faint", 2))]
+    judge = _table_judge(draw, both, training=training, runs=runs)
+    before, after = judge.reducible([])[1], judge.reducible(both)[1]
+    touching = 4000.0  # what the contact alone shows: nobody can foretell it
+    assert before - after == pytest.approx(0.25 * 4000 * (1 if training == 2 else 3), rel=0.15)
+    assert after == pytest.approx(touching, rel=0.15)
+
+
 def test_two_that_only_stand_together_are_found():
     """What one recording shows the sum of and another both of: each alone is a compromise that both speak against."""
 
@@ -259,6 +276,23 @@ def test_what_rises_on_a_level_is_reshaped_with_the_level():
     assert judge.gain([compromise, level]) - judge.gain([compromise]) > 35.0
     assert not judge._stays([compromise], level)
     assert judge.select() == [rise, level]
+
+
+@pytest.mark.parametrize(
+    ("slip", "names"), [(0.0, {"coulomb_friction", "stribeck_friction"}), (0.1, {"lugre_friction"})]
+)
+def test_bristles_that_slip_by_nothing_are_a_level_and_a_rise(slip, names):
+    """Alone the level gains less than the bristles, and beside them nothing; what they slip by makes them one law."""
+
+    def draw(run, random):
+        level, rise, rest = (random.standard_normal(4000) for _ in range(3))
+        bristles = 5.0 * level + 3.0 * rise + slip * rest
+        return [random.standard_normal(4000) + bristles, level, rise, bristles]
+
+    place = "macro_force"
+    level, rise = Group(("coulomb_friction", place), (1,)), Group(("stribeck_friction", place), (2,), searched=1)
+    judge = _table_judge(draw, [level, rise, Group(("lugre_friction", place), (3,), searched=3)])
+    assert {group.key[0] for group in judge.select()} == names
 
 
 def test_a_law_that_loses_by_more_than_is_left_is_none_that_inexact_laws_excuse():

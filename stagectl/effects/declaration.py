@@ -50,7 +50,12 @@ CONTACT_QUANTITIES = (
 EDGE_QUANTITIES = ("contact_side_ratio", "t_s")
 """What the place of an edge of the gap may depend on."""
 
-COMMAND_QUANTITIES = ("command_a", "t_s", "dt_s")
+COMMAND_QUANTITIES = (
+    "command_a",
+    "current_loop_s",  # lag of the axis' current loop as it is stated; only for effects with a memory
+    "t_s",
+    "dt_s",
+)
 """What an effect on the way of the current command may depend on; time is that of the substep's start."""
 
 SENSOR_QUANTITIES = ("position_m", "velocity_m_per_s", "acceleration_m_per_s2", "t_s", "dt_s")
@@ -218,6 +223,8 @@ def _memory_problem(arguments: tuple[str, ...], places: tuple[str, ...], memory:
         return f"memory = {memory} in the decorator, and the law {'takes' if takes else 'does not take'} a memory"
     if takes and "dt_s" not in arguments:
         return "a law with memory advances it by dt_s"
+    if not takes and "current_loop_s" in arguments:
+        return "what depends on the current loop's lag is no law without memory"
     if takes and "contact_edge" in places:
         return "the place of an edge has no memory: both edges are asked in every substep"
     return ""

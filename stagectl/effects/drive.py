@@ -62,18 +62,21 @@ def amplifier_dead_band(command_a, half_width_a):
     time_constant_s=(1e-6, 0.02),
     searched=("time_constant_s",),
     shown_by="acceleration",
-    symptom="proportional to the change of the command; fades with one time constant",
+    symptom="proportional to the change of the command; fades with the time constant of the whole loop",
     reference="Franklin, Powell, Workman, Digital Control of Dynamic Systems, section 4.3: first-order lag, held input",
 )
-def current_loop_lag(command_a, dt_s, time_constant_s, memory):
-    """Lag of the drive besides its nominal current loop: y' = (i - y) / tau, and y - i is added.
+def current_loop_lag(command_a, current_loop_s, dt_s, time_constant_s, memory):
+    """Current loop that is slower than stated, of one lag: T + tau in place of T.
 
-    memory: y. The drive's command is held over a step, so the step is exact; what is added is its mean.
+    y' = (i - y) / (T + tau), and tau / (T + tau) (y - i) is added before the stated loop, T. memory: y. The drive's
+    command is held over a step, so the step is exact; what is added is its mean. Two lags in a row would be another
+    machine: of one loop of 0.65 ms they left 73 squares of 4100, which a flexible mode then explained.
     """
+    whole_s = current_loop_s + time_constant_s
     apart = memory[0] - command_a
     if not dt_s > 0.0:
-        return apart
-    left = np.exp(-dt_s / time_constant_s)
+        return apart * time_constant_s / whole_s
+    left = np.exp(-dt_s / whole_s)
     memory[0] = command_a + apart * left
     return apart * (1.0 - left) * time_constant_s / dt_s
 

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from stagectl import compose
 from stagectl.compiled import compiled
-from stagectl.effects import Effect
+from stagectl.effects import CATALOGUE, Effect
 
 PARTS_COUNT = 4
 """Parts of a sample interval: friction on whole milliseconds left 57 times its noise, on quarters 8 (prototype)."""
@@ -21,6 +21,7 @@ _RESPONSE_PERIODS = (16, 256)  # of a step response: the second where it has not
 _FADING_LAGS = 12.0
 _FADED = 1e-6  # of the greatest part of a step response: all behind it is left out
 _SAME_RATIO = 1e-9
+_LAG = CATALOGUE["current_loop_lag"]
 
 
 def delayed(command: np.ndarray, latch_ratio: float, parts: int = PARTS_COUNT) -> np.ndarray:
@@ -104,33 +105,42 @@ def changed_by(
     Effects that are neither linear nor without memory are run on means over parts of intervals.
     """
     if not effect.memory:
-        return driven(_run(effect, parameters, command[:, None], period_s)[:, 0], latch_s, lag_s, period_s)
-    response = _step_response(effect, parameters, period_s, 1.0)
-    doubled = _step_response(effect, parameters, period_s, 2.0)
+        return driven(_run(effect, parameters, command[:, None], lag_s, period_s)[:, 0], latch_s, lag_s, period_s)
+    response = _step_response(effect, parameters, lag_s, period_s, 1.0)
+    doubled = _step_response(effect, parameters, lag_s, period_s, 2.0)
     if doubled.size == response.size and np.allclose(doubled, 2.0 * response, rtol=_SAME_RATIO, atol=_SAME_RATIO):
         return _stepped(response, command, latch_s, lag_s, period_s)
-    fine = _run(effect, parameters, delayed(command, latch_s / period_s), period_s)
+    fine = _run(effect, parameters, delayed(command, latch_s / period_s), lag_s, period_s)
     return lagged(fine, lag_s, period_s)
 
 
-def _run(effect: Effect, parameters: list[float], command: np.ndarray, period_s: float) -> np.ndarray:
+def behind(
+    more_s: float, command: np.ndarray, latch_s: float, lag_s: float, period_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what one more lag behind a drive adds to its answer to held commands, as `changed_by` has it."""
+    response = _step_response(_LAG, [more_s], 0.0, period_s, 1.0)
+    return _stepped(response, command, latch_s, lag_s, period_s)
+
+
+def _run(effect: Effect, parameters: list[float], command: np.ndarray, lag_s: float, period_s: float) -> np.ndarray:
     """Run an effect along held commands on equal parts of intervals, shape (n, parts); shape kept."""
     parts = command.shape[1]
     dt_s = period_s / parts
     times_s = (np.arange(command.size) * dt_s).reshape(command.shape)
     known = {"command_a": command, "t_s": times_s, "dt_s": np.full(command.shape, dt_s)}
+    known["current_loop_s"] = np.full(command.shape, lag_s)
     columns = np.column_stack([known[name].ravel() for name in effect.quantities])
     out = compose.along(effect)(columns, np.array([*parameters, 0.0]), np.zeros(max(effect.memory, 1)))
     return np.asarray(out).reshape(command.shape)
 
 
-def _step_response(effect: Effect, parameters: list[float], period_s: float, height: float) -> np.ndarray:
+def _step_response(effect: Effect, parameters: list[float], lag_s: float, period_s: float, height: float) -> np.ndarray:
     """Return what an effect adds to a step of its command, means over steps of a fine grid."""
     out = np.zeros(1)
     for periods in _RESPONSE_PERIODS:
         command = np.full((round(periods / _STEP_RATIO) + 1, 1), height)
         command[0] = 0.0  # an effect may take the first command that it sees for one that was always there
-        out = _run(effect, parameters, command, _STEP_RATIO * period_s)[1:, 0]
+        out = _run(effect, parameters, command, lag_s, _STEP_RATIO * period_s)[1:, 0]
         there = np.flatnonzero(np.abs(out) > _FADED * np.max(np.abs(out)))
         if not there.size:
             return out[:1]

@@ -18,14 +18,13 @@ import numpy as np
 from stagectl import compose
 from stagectl.compiled import compiled
 from stagectl.effects import CATALOGUE, Effect, Trait
-from stagectl.gap.command_path import PARTS_COUNT, changed_by, driven, lagged
+from stagectl.gap.command_path import PARTS_COUNT, behind, driven, lagged
 from stagectl.gap.log import Log
 from stagectl.gap.motion import Motion
 
 Row = dict[str, Any]
 """An effect as a row of a profile."""
 
-_LOOP_LAG = CATALOGUE["current_loop_lag"]
 _LATE = {Trait.LATE_READING, Trait.TIME_SHIFT}
 
 
@@ -75,7 +74,7 @@ def motor_n(
     def made(latch_s: float) -> np.ndarray:
         total_n, _ = driven(command_n, latch_s, loop_s, h)
         for lag_s in lags_s:
-            total_n = total_n + changed_by(_LOOP_LAG, [lag_s], command_n, latch_s, loop_s, h)[0]
+            total_n = total_n + behind(lag_s, command_n, latch_s, loop_s, h)[0]
         return total_n
 
     return _at_delays(made, latch_s, delay_s(rows, axis, log), h)

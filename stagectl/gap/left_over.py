@@ -17,10 +17,9 @@ zone came out as a spring, a cable that slips, a cogging as long as the travel a
 better than a curve over position."""
 
 
-def excess(search: Competition, chosen: list[Group]) -> float:
+def excess(judge: Judge, chosen: list[Group]) -> float:
     """Return what is left above the noise, in squares of it."""
-    sums = search.evidence.sums
-    return sum(float(s.gram[0, 0]) - s.count for s in sums) - search.judge.gain(chosen)
+    return sum(float(s.gram[0, 0]) - s.count for s in judge.source.sums) - judge.gain(chosen)
 
 
 def _noise(search: Competition) -> float:
@@ -39,8 +38,8 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
     if instead is not None:
         beside = [group for group in chosen if not any(group is other for other in crowd)]
         gained = judge.gain([*beside, instead]) - judge.gain(beside)
-        return _curve_found(search, beside, instead, excess(search, beside), before_excess, gained)
-    left, first = excess(search, chosen), before_excess
+        return _curve_found(search, beside, instead, excess(judge, beside), before_excess, gained)
+    left, first = excess(judge, chosen), before_excess
     noise = _noise(search)
     best, gained = None, 0.0
     for curve in search.curves:

@@ -20,8 +20,9 @@ from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
-from stagectl.gap.selection import ALIAS_GAIN
+from stagectl.gap.selection import ALIAS_GAIN, Judge
 from stagectl.gap.settling import (
+    belief_under,
     is_taken_at_size,
     left_at_size,
     moved_by,
@@ -42,6 +43,7 @@ class Look(NamedTuple):
     chosen: list[Group]
     named: tuple[Named, ...]
     solution: Solution | None = None
+    belief: Judge | None = None  # of what the belief leaves, in units of this look's noise
 
 
 def looked_closely(
@@ -57,7 +59,7 @@ def looked_closely(
     """
     found = first.judge.select(until=lambda group: moves_joint(first, group))
     look = plain = _of_best_form(Look(first, found, all_named(first, found)), unsettled, crew)
-    known, moved, before = plain, (), excess(first, [])
+    known, moved = plain, ()
     refused: frozenset[tuple[str, str]] = frozenset()
     for _ in range(_CLOSER_LOOKS):
         if not known.chosen and not moved:
@@ -68,7 +70,9 @@ def looked_closely(
         solution = solve([*search.judge.base, *chosen], search.evidence.sums)
         at_size = remeasured(search, solution, known.named, search.moved) if search.moved else ()
         look = Look(search, chosen, at_size + all_named(search, chosen))
-        if search.judge.lacks_a_name(chosen) and unknown_rest(search, chosen, before) is not None:
+        if search.judge.lacks_a_name(chosen) and unknown_rest(
+            search, chosen, excess(belief_under(first, search, crew), [])
+        ):
             break  # no further look gives it one
         gone = {(one.name, one.acts_on) for one in at_size if not stands(one, search.evidence.recordings[0])}
         if gone:  # at its size it is nothing
@@ -86,9 +90,12 @@ def looked_closely(
             known, moved = look, moved_now(search, look.chosen)
         else:
             break
-    if unknown_rest(look.search, look.chosen, before) and not unknown_rest(first, plain.chosen, before):
-        look = plain  # the first look had reached the floor
-    return _measured(look)
+    belief = belief_under(first, look.search, crew)
+    if unknown_rest(look.search, look.chosen, excess(belief, [])) and not unknown_rest(
+        first, plain.chosen, excess(first.judge, [])
+    ):
+        look, belief = plain, first.judge  # the first look had reached the floor
+    return _measured(look)._replace(belief=belief)
 
 
 _ALONG_ITSELF = frozenset({Trait.FIRST_ORDER, Trait.SWINGS})

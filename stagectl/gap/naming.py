@@ -9,11 +9,12 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap import hypotheses
 from stagectl.gap.believed import Believed
 from stagectl.gap.competition import Competition
-from stagectl.gap.findings import Named, ParameterError
+from stagectl.gap.findings import Named, ParameterError, title_of
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.quantities import along_motion, in_order, quantities
 from stagectl.gap.recording import Recording
+from stagectl.gap.selection import CONTRADICTION
 from stagectl.gap.settling import power_of_size, settled_by
 
 
@@ -225,6 +226,16 @@ def friction_that_drives(named: Sequence[Named], recordings: Sequence[Recording]
         if not abs(slope) * reach_m - slack_n <= level_n:
             found.append(one)
     return tuple(found)
+
+
+def spoken_against(named: Sequence[Named]) -> tuple[str, ...]:
+    """Say of which names recordings that no fit saw are explained worse than without, by more than noise."""
+    return tuple(
+        f"{title_of(one.name, one.acts_on)}: as large as training says it is it leaves {-one.held_out_gain:.0f} "
+        "squares of the noise more on recordings that no fit saw; `gap next` has the move that shows it"
+        for one in named
+        if one.held_out_gain < -CONTRADICTION
+    )
 
 
 _OF_ONE_PITCH = ("cogging", "harmonic_cogging")

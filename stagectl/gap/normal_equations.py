@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import eigh
 
 _JITTER = 1e-10
 _BOUND_SDS = 2.0
@@ -62,6 +63,7 @@ class Solution:
     slots: tuple[tuple[int, str], ...]  # (column, "" or the session or run that it is of)
     values: np.ndarray
     covariance: np.ndarray
+    normal: np.ndarray  # of the amplitudes, priors included
     gain: float  # over none of them, and over what is fixed
     scattered: tuple[np.ndarray, ...] = ()  # covariances by how stretches of the recordings scatter, where asked for
 
@@ -88,7 +90,7 @@ def solve(groups: Sequence[Group], sums: Sequence[Sums], fixed: Sequence[int] = 
     size = len(slots)
     normal, right = normal_of(slots, precision, sums, fixed)
     if not size:
-        return Solution(tuple(groups), (), np.zeros(0), np.zeros((0, 0)), 0.0)
+        return Solution(tuple(groups), (), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0)), 0.0)
     scale = np.sqrt(np.diag(normal))
     scale[scale == 0.0] = 1.0  # a column that nothing excites
     scaled = normal / np.outer(scale, scale) + _JITTER * np.eye(size)
@@ -96,7 +98,7 @@ def solve(groups: Sequence[Group], sums: Sequence[Sums], fixed: Sequence[int] = 
     values = inverse @ right
     # what these values do lower the squares by: near-collinear columns make the inverse coarse, and r'v too large
     gain = float(2.0 * right @ values - values @ normal @ values)
-    return Solution(tuple(groups), tuple(slots), values, inverse, gain)
+    return Solution(tuple(groups), tuple(slots), values, inverse, normal, gain)
 
 
 def within_bounds(solution: Solution) -> bool:
@@ -119,21 +121,64 @@ def within_bounds(solution: Solution) -> bool:
 def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
     """Return by how much amplitudes from elsewhere lower the squares of recordings that no fit saw.
 
-    Amplitudes that belong to a session are solved there, and cost what so many free amplitudes gain on noise.
+    Amplitudes that belong to a session are solved there, and cost what so many free amplitudes gain on noise. What
+    their recordings leave open is not foretold, see `_foretelling`.
     """
     fixed = [k for k, (_, scope) in enumerate(solution.slots) if scope == ""]
     own = sorted({column for column, scope in solution.slots if scope != ""})
-    total = 0.0
     columns = [solution.slots[k][0] for k in fixed]
-    theta = solution.values[fixed]
+    elsewhere = sum((_beside_own(s, columns, own) for s in held), np.zeros((len(fixed), len(fixed))))
+    theta = _foretelling(solution, fixed, elsewhere)
+    total = 0.0
     for s in held:
         total += float(2.0 * theta @ s.gram[columns, 0] - theta @ s.gram[np.ix_(columns, columns)] @ theta)
         if own:
             right = s.gram[own, 0] - s.gram[np.ix_(own, columns)] @ theta
-            normal = s.gram[np.ix_(own, own)]
-            normal = normal + (_JITTER * np.trace(normal) + 1e-300) * np.eye(len(own))
-            total += float(right @ np.linalg.solve(normal, right)) - len(own)
+            total += float(right @ np.linalg.solve(_normal_of_own(s, own), right)) - len(own)
     return total
+
+
+OPEN_SDS = 5.0
+"""Deviations below which a sum of amplitudes is as good as open: above, it foretells more than it spoils even where it
+is 2.5 of them off."""
+
+
+def _foretelling(solution: Solution, fixed: Sequence[int], elsewhere: np.ndarray) -> np.ndarray:
+    """Return amplitudes that say nothing of other recordings where their own leave open what that would be.
+
+    elsewhere: normal matrix of the same amplitudes there. Sums of amplitudes that are independent on both sides
+    (eigenvectors of one normal matrix in the metric of the other) are taken one by one, and those within `OPEN_SDS`
+    deviations of zero are zero: their own recordings are explained as well without. An error of a reading that one
+    recording shows by contact, and others by a soft spring only, was foretold to a hundred times what it is.
+    """
+    if not fixed:
+        return np.zeros(0)
+    rest = [k for k in range(len(solution.slots)) if k not in fixed]
+    normal = solution.normal[np.ix_(fixed, fixed)]
+    if rest:
+        cross = solution.normal[np.ix_(fixed, rest)]
+        inner = solution.normal[np.ix_(rest, rest)]
+        normal = normal - cross @ np.linalg.pinv(inner, hermitian=True) @ cross.T
+    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    scale[scale == 0.0] = 1.0  # nothing is known of it
+    weights = np.outer(scale, scale)
+    _, sums = eigh(elsewhere / weights, normal / weights + _JITTER * np.eye(scale.size))
+    sizes = sums.T @ (normal / weights) @ (solution.values[list(fixed)] * scale)
+    return sums @ np.where(np.abs(sizes) > OPEN_SDS, sizes, 0.0) / scale
+
+
+def _beside_own(s: Sums, columns: Sequence[int], own: Sequence[int]) -> np.ndarray:
+    """Return the normal matrix of columns beside those whose amplitudes a recording has to itself."""
+    normal = s.gram[np.ix_(columns, columns)]
+    if not own:
+        return normal
+    cross = s.gram[np.ix_(columns, own)]
+    return normal - cross @ np.linalg.solve(_normal_of_own(s, own), cross.T)
+
+
+def _normal_of_own(s: Sums, own: Sequence[int]) -> np.ndarray:
+    normal = s.gram[np.ix_(own, own)]
+    return normal + (_JITTER * np.trace(normal) + 1e-300) * np.eye(len(own))
 
 
 class Fold:

@@ -60,6 +60,9 @@ BETWEEN_SDS = 3.0
 LEFT_SDS = 3.0
 """Deviations of the floor by which more may be left than is seen."""
 
+_PART_PASSES = 2
+"""Times that each of two laws that replace one is searched beside the other."""
+
 LOW_SPEED_SHARE = 0.02
 """Of a machine with more force noise than its sensors explain, no friction is an exact law: at speed, where a velocity
 has a sign, dry and sub-linear friction differ by 1.2 % of their gain on a real axis. Slow reversals tell them apart."""
@@ -197,7 +200,7 @@ class Judge:
             if state in seen or any(until(group) for group in chosen):
                 break
             seen.add(state)
-        return chosen
+        return self._in_parts(chosen)
 
     def _pair(self, chosen: Sequence[Group], rivals: Sequence[Group]) -> list[Group]:
         """Return the two that gain most of those that stay beside each other; none where there are no such two.
@@ -233,6 +236,42 @@ class Judge:
             if not self.leaves_curve(anew) and self._allowed(anew) and self.foretold(anew) > self.foretold(chosen):
                 grown.append(anew)
         return max(grown, key=self._worth, default=[])
+
+    def _in_parts(self, chosen: Sequence[Group]) -> list[Group]:
+        """Return frictions of many numbers as two of fewer that can't be told from them.
+
+        What rises towards standstill on a level is two laws, and bristles that slip by nothing are both of them at
+        once. Alone, neither gains what the bristles do: no round in which one name takes another's place comes by.
+        """
+        found = list(chosen)
+        for group in chosen:
+            if not _shows_at_low_speed(group):
+                continue
+            rest = [other for other in found if other is not group]
+            parts = self._two_like(rest, group)
+            as_good = self._worth([*rest, *parts]) > self._worth(found) - ALIAS_GAIN
+            if parts and as_good and self._allowed([*rest, *parts]):
+                found = [*rest, *parts]
+        return found
+
+    def _two_like(self, rest: Sequence[Group], group: Group) -> list[Group]:
+        """Return the two frictions of the same body, of fewer numbers in all, that gain most, at their best shapes."""
+        taken = {other.key for other in (*rest, group)}
+        akin = [
+            other
+            for other in self.library
+            if other.key[1] == group.key[1] and other.key not in taken and _shows_at_low_speed(other)
+        ]
+        pairs = [
+            [one, other]
+            for one, other in itertools.combinations(akin, 2)
+            if one.key != other.key and _form(one) + _form(other) < _form(group)
+        ]
+        best = max(pairs, key=lambda pair: self._worth([*rest, *pair]), default=[])
+        for _ in range(_PART_PASSES if best else 0):
+            for k in range(2):
+                (best[k],) = self.refine([*self.base, *rest, best[1 - k]], [best[k]])
+        return best
 
     def rivals(self, chosen: Sequence[Group]) -> list[Group]:
         """Return the names that gain most beside `chosen`, each at its best shape."""

@@ -21,6 +21,7 @@ from stagectl.gap.naming import (
     parameter_errors,
     refitted_errors,
     second_pitches,
+    spoken_against,
     without_widths,
 )
 from stagectl.gap.noise import noise_of
@@ -105,14 +106,14 @@ def _found(
     say(f"{len(judge.library)} hypotheses of {len({g.key for g in judge.library})} names on {len(logs)} recordings")
     judge.calibrate()
     say("effects compete")
-    before = judge.reducible_before()
     look = looked_closely(first, unsettled, without, say, crew)
     solution = look.solution or solve([*look.search.judge.base, *look.chosen], look.search.evidence.sums)
     named, widths = without_widths(look.named, look.search)
     doubtful = (*friction_that_drives(named, look.search.evidence.recordings), *second_pitches(named))
     gone = {(one.name, one.acts_on) for one in doubtful}
     possible = [group for group in look.chosen if group.key not in gone]
-    unknown = unknown_rest(look.search, possible, excess(first, []))
+    belief = look.belief or judge
+    unknown = unknown_rest(look.search, possible, excess(belief, []))
     if unknown is not None:
         unknown["beside"] = [[effect.name, effect.acts_on] for effect in named]
         named = ()
@@ -128,10 +129,10 @@ def _found(
         not_excited=first.not_excited(),
         not_separable=tuple(one.text for one in not_separable(first.evidence.recordings)),
         unknown=unknown,
-        reducible_before=before,
+        reducible_before=belief.reducible_before(),
         reducible_after=look.search.judge.reducible(look.chosen),
         threshold=judge.threshold,
-        remarks=(*remarks, *(remark for log in logs for remark in log.remarks)),
+        remarks=(*remarks, *spoken_against(named), *(remark for log in logs for remark in log.remarks)),
         trace=tuple(judge.trace),
         refitted_sds={name: sd for name, (_, sd) in refitted.items()},
         profile_path=believed.path,
