@@ -194,6 +194,22 @@ def test_a_search_of_shapes_that_depend_on_each_other_ends_where_they_are():
     assert outcome[0].shape == pytest.approx(true, rel=0.01)
 
 
+def test_what_asks_for_a_size_that_no_effect_can_have_stays_as_it_is():
+    """A motor that grows stronger with its force asks for less than no saturation."""
+
+    def stronger_n(command_n: float, x: float, v: float) -> float:
+        return command_n * (1.0 + (command_n / 800.0) ** 2)
+
+    recording = balance.recording_of(_axis_under(stronger_n, 1), AXIS)
+    balance.set_noise(recording, slow_noise(AXIS, recording))
+    evidence = Evidence([recording])
+    evidence.finish(np.zeros(0), 0, 0)
+    refiner = Refiner(evidence, [])
+    term = hypotheses.term_of(CATALOGUE["force_constant_saturation"], "macro_actuator", {"saturation_n": 15.0})
+    assert refiner.refined(term) is None
+    assert refiner.gain_at_size(term) == 0.0
+
+
 SHARE, MODE_HZ, MODE_DAMPING = 0.06, 22.0, 0.02
 
 

@@ -88,7 +88,10 @@ class Refiner:
         return self
 
     def refined(self, term: Term) -> tuple[Term, int] | None:
-        """Return the term at its best shape, and how many numbers were searched; None where there are none."""
+        """Return the term at its best shape, and how many numbers were searched.
+
+        None where there are none to search, or where no size that its effect can have is near what recordings ask for.
+        """
         if term.acts_on == "parameter":
             return None
         free = free_shapes(CATALOGUE[term.name])
@@ -97,7 +100,10 @@ class Refiner:
             return None
         slope, moves = term, entire and term.acts_on.endswith(("_sensor", "contact_edge"))
         if entire:
-            term = self._at_size(term)
+            at_size = self._at_size(term)
+            if at_size is None:
+                return None
+            term = at_size
             free = tuple(dict.fromkeys((*CATALOGUE[term.name].parameters[:1], *free)))
         shape = dict(term.shape)
         best = self._gain(term)
@@ -121,16 +127,19 @@ class Refiner:
 
     def gain_at_size(self, term: Term) -> float:
         """Return what a hypothesis gains at the best of a few sizes, where its column is of no use: in contact."""
-        return max(self._gain(trial, self._evidence.columns_of_trial) for trial in self._trials(term))
+        gains = (self._gain(trial, self._evidence.columns_of_trial) for trial in self._trials(term))
+        return max(gains, default=0.0)
 
-    def _at_size(self, term: Term) -> Term:
-        """Take an amplitude into the shape: the best of some."""
-        return max(self._trials(term), key=lambda trial: self._gain(trial, self._evidence.columns_of_trial))
+    def _at_size(self, term: Term) -> Term | None:
+        """Take an amplitude into the shape: the best of some; None where its effect can have none of them."""
+        trials = self._trials(term)
+        return max(trials, key=lambda trial: self._gain(trial, self._evidence.columns_of_trial), default=None)
 
     def _trials(self, term: Term) -> list[Term]:
         """Return a term at amplitudes that move readings or edges by some micrometres.
 
-        Elsewhere, at a few steps about what the column asks for.
+        Elsewhere, at a few steps about what the column asks for. None of those that its effect can't have: a motor that
+        grows stronger with its force asks for less than no saturation.
         """
         effect = CATALOGUE[term.name]
         amplitude = effect.parameters[0]
