@@ -141,6 +141,7 @@ TRANSLATIONS: tuple[Translation, ...] = (
             "breakaway_ratio": _same("static_ratio"),
             "velocity_m_per_s": _same("stribeck_m_per_s"),
             "distance_m": _same("slip_m"),
+            "bristle_damping_s": _same("bristle_damping_s"),
         },
     ),
     Translation(

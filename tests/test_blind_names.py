@@ -75,7 +75,7 @@ CASES = [  # truth, place, our parameters, of the effect beside it
     ("micro_reaction", "macro_force", {"fraction_ratio": 0.6}, {}),
     ("dahl_friction", "macro_force", {"level_n": 2.0, "slip_m": 2e-5}, {}),
     ("lugre_friction", "macro_force",
-     {"level_n": 2.0, "static_ratio": 1.5, "stribeck_m_per_s": 5e-3, "slip_m": 2e-5}, {}),
+     {"level_n": 2.0, "static_ratio": 1.5, "stribeck_m_per_s": 5e-3, "slip_m": 2e-5, "bristle_damping_s": 3e-4}, {}),
 ]  # fmt: skip
 
 

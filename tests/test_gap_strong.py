@@ -194,6 +194,27 @@ def test_a_search_of_shapes_that_depend_on_each_other_ends_where_they_are():
     assert outcome[0].shape == pytest.approx(true, rel=0.01)
 
 
+def test_bristles_are_searched_with_their_damping():
+    """From a place of the grid, where all four shapes are off: line by line their damping stays a third off."""
+    true = {"static_ratio": 1.4, "stribeck_m_per_s": 2e-3, "slip_m": 17e-6, "bristle_damping_s": 9e-4}
+
+    def rubbed_by(memory: np.ndarray) -> Callable[[float, float, float], float]:
+        law = CATALOGUE["lugre_friction"].law
+        return lambda command_n, x, v: command_n + law(v, H / STEPS, 2.0, *true.values(), memory)
+
+    recordings = [balance.recording_of(_axis_under(rubbed_by(np.zeros(1)), seed), AXIS) for seed in (1, 2)]
+    for recording in recordings:
+        balance.set_noise(recording, slow_noise(AXIS, recording))
+    evidence = Evidence(recordings)
+    evidence.finish(np.zeros(0), 0, 0)
+    off = {"static_ratio": 1.5, "stribeck_m_per_s": 3e-3, "slip_m": 2e-5, "bristle_damping_s": 3e-4}
+    outcome = Refiner(evidence, []).refined(hypotheses.term_of(CATALOGUE["lugre_friction"], "macro_force", off))
+    assert outcome is not None
+    found = outcome[0].shape
+    assert found.pop("bristle_damping_s") == pytest.approx(9e-4, abs=H / STEPS)  # a force is known within a step
+    assert found == {name: pytest.approx(true[name], rel=0.02) for name in found}
+
+
 def test_what_asks_for_a_size_that_no_effect_can_have_stays_as_it_is():
     """A motor that grows stronger with its force asks for less than no saturation."""
 

@@ -111,10 +111,10 @@ class Refiner:
             before = best
             for name in free:
                 shape, best = self._line(term, shape, name, best, 2.0 if entire and not sweep else 0.4**sweep)
-            if sweep + 1 >= _SWEEPS and not best - before > _SWEPT_GAIN:
+            if sweep + 1 >= _SWEEPS and (_has_valley(term, free) or not best - before > _SWEPT_GAIN):
                 break
         found = with_shape(term, shape)
-        if not found.linear and found.scope == "structural":
+        if found.scope == "structural" and (not found.linear or _has_valley(found, free)):
             found, best = self._stepped(found, free, best)
         if moves and self._is_beside_slopes and self._free_gain(slope) > best:
             found = replace(slope, is_slope=True)  # its size is found together with theirs
@@ -183,7 +183,7 @@ class Refiner:
         return shape, best
 
     def _stepped(self, term: Term, free: Sequence[str], best: float) -> tuple[Term, float]:
-        """Return a term at its size at the shapes that its slopes ask for, as long as a step gains (Gauss-Newton).
+        """Return a term at the shapes that its slopes ask for, as long as a step gains (Gauss-Newton).
 
         Line by line a search goes zigzag where shapes depend on each other: a share of 15 % of the mass at 18.8 Hz came
         out as 26 % at 18.5 Hz, with a third of a million squares left; five steps from there left none.
@@ -204,17 +204,25 @@ class Refiner:
         return term, best
 
     def _asked_of_slopes(self, term: Term, free: Sequence[str]) -> dict[str, float]:
-        """Return by how much shapes are to change, all of them together."""
-        parts, spans = [self._evidence.columns_of(term)], {}
-        for name in free:
-            low, high = reach_of(self._evidence.recordings, term, name, _SLOPE_RATIO)
-            if high > low:
-                ends = (self._evidence.columns_of(with_shape(term, {name: at})) for at in (high, low))
-                parts.append(_difference(*ends))
-                spans[name] = high - low
+        """Return by how much shapes are to change, all of them together, and amplitudes that are solved for with them.
+
+        Slopes over shapes are those of what the term does at the amplitudes that are best before the step.
+        """
+        here = self._evidence.columns_of(term)
+        parts, spans = [here], {}
         try:
-            normal, right = self._reduced(_side_by_side(parts), replace(term, amplitudes=(term.name, *spans)))
-            steps = self._solved(normal[1:, 1:], right[1:] - normal[1:, 0])
+            sizes = self._amplitudes(here, term) if term.linear else np.ones(1)
+            for name in free:
+                low, high = reach_of(self._evidence.recordings, term, name, _SLOPE_RATIO)
+                if high > low:
+                    ends = (self._evidence.columns_of(with_shape(term, {name: at})) for at in (high, low))
+                    parts.append(_weighted(_difference(*ends), sizes))
+                    spans[name] = high - low
+            normal, right = self._reduced(_side_by_side(parts), replace(term, amplitudes=(*term.amplitudes, *spans)))
+            if term.linear:
+                steps = self._solved(normal, right)[sizes.size :]
+            else:
+                steps = self._solved(normal[1:, 1:], right[1:] - normal[1:, 0])
         except np.linalg.LinAlgError:  # two shapes that do the same
             return {}
         return {name: float(step) * span for step, (name, span) in zip(steps, spans.items(), strict=True)}
@@ -287,6 +295,19 @@ def _difference(a: Columns, b: Columns) -> Columns:
         return one - other
 
     return [[of(*pair) for pair in zip(*pairs, strict=True)] for pairs in zip(a, b, strict=True)]
+
+
+def _weighted(columns: Columns, weights: np.ndarray) -> Columns:
+    """Return the sum of a term's columns, each so many times, as the one column of a term."""
+    return [[None if part is None else weights[None, :] @ part for part in parts] for parts in columns]
+
+
+def _has_valley(term: Term, free: Sequence[str]) -> bool:
+    """Tell whether several shapes of a linear law are searched: they depend on each other, as bristles do.
+
+    Line by line a friction of bristles ended at 0.68 ms of damping for 0.95, with 1300 squares left of 6 million.
+    """
+    return term.linear and term.scope == "structural" and len(free) > 1
 
 
 def _side_by_side(columns: Sequence[Columns]) -> Columns:
