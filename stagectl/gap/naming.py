@@ -276,10 +276,9 @@ def refitted_errors(
             for name in hypotheses.parts_of(term.name):
                 groups[name].append(group)
     found = {name: solution.total_of(summed) for name, summed in groups.items()}
-    if not search.moved:
-        for name, change in settled_by(believed, search.evidence.recordings[0]).items():
-            value, sd = found[name]
-            found[name] = value + change, sd
+    for name, change in settled_by(believed, search.evidence.recordings[0]).items():
+        value, sd = found[name]
+        found[name] = value + change, sd
     for wrong in widths:
         for name in hypotheses.parts_of(wrong.name):
             value, sd = found[name]
