@@ -21,6 +21,7 @@ from stagectl.gap.naming import friction_that_drives, refitted_errors, second_pi
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group, solve
 from stagectl.gap.operating_point import operating_point, with_joint_changed
+from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner
 from stagectl.gap.settling import settled_by
 
@@ -202,10 +203,20 @@ def test_of_two_bodies_that_are_both_late_the_contact_notices_nothing(beside):
     assert np.std((alone + other)[inner].mean(axis=1)) < 0.05 * np.std(alone[inner])
 
 
-def test_what_a_joint_was_settled_by_is_refitted_beside_what_is_part_of_the_operating_point(touching):
+def _both_driven(believed: Believed) -> Recording:
+    """Both bodies swing along, and 90 um apart, twice a second, under half as much force on the end."""
+    both_n = -MASS_KG * W * W * _swing(T_S + 0.5 * H)
+    log = Log(
+        "run", H, _swing(T_S) + 90e-6 * np.sin(2.0 * np.pi * 2.0 * T_S), both_n, np.ones(COUNT, bool), "1",
+        end_position_m=_swing(T_S), micro_command_n=0.5 * both_n,
+    )  # fmt: skip
+    return balance.recording_of(log, believed)
+
+
+def test_what_a_joint_was_settled_by_is_refitted_beside_what_is_part_of_the_operating_point():
     """A contact damping that is 14 % off was told as 0.2 % where a dead band had been found."""
     moved = ((CATALOGUE["amplifier_dead_band"], "micro_command", {"half_width_a": 0.01}),)
-    there = operating_point(with_joint_changed(touching, 0.2e-6, -0.1e-6, 0.14), moved)
+    there = operating_point(with_joint_changed(_both_driven(STAGE), 0.2e-6, -0.1e-6, 0.14), moved)
     noise = slow_noise(STAGE, there)
     search = Competition([there], 1, without=frozenset(CATALOGUE), moved=moved, noise=noise)
     solution = solve(search.judge.base, search.evidence.sums)
@@ -228,16 +239,11 @@ def test_masses_and_forces_that_are_all_larger_alike_change_nothing():
              "phase_rad": 0.3},
         ),
     )  # fmt: skip
-    both_n = -MASS_KG * W * W * _swing(T_S + 0.5 * H)
-    log = Log(
-        "run", H, _swing(T_S) + 90e-6 * np.sin(2.0 * np.pi * 2.0 * T_S), both_n, np.ones(COUNT, bool), "1",
-        end_position_m=_swing(T_S), micro_command_n=0.5 * both_n,
-    )  # fmt: skip
     moved = [
         (CATALOGUE["amplifier_dead_band"], "micro_command", {"half_width_a": 0.3}),
         (CATALOGUE["command_delay"], "macro_command", {"delay_s": 1.7e-3}),
     ]
-    there = operating_point(balance.recording_of(log, believed), moved)
+    there = operating_point(_both_driven(believed), moved)
     total = Forces()
     scaled = {"micro_reaction on macro_force", "current_ripple on macro_actuator"}  # shares of a motor's force
     for term, _ in hypotheses.parameter_terms(there):
