@@ -14,7 +14,8 @@ from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.quantities import along_motion, in_order, quantities
 from stagectl.gap.recording import Recording
-from stagectl.gap.settling import power_of_size, settled_by
+from stagectl.gap.refinement import power_of_size
+from stagectl.gap.settling import settled_by
 
 
 def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:

@@ -15,6 +15,7 @@ from scipy.optimize import minimize_scalar
 from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap import hypotheses
 from stagectl.gap.evidence import Columns, Evidence
+from stagectl.gap.forces import squares_of
 from stagectl.gap.grids import free_shapes
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Placed, active_slots, covers, normal_of
@@ -33,6 +34,7 @@ _ANCHOR_M = 1.0
 _NEAR_ZERO = 0.05
 LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)
+_LEAST_ASKED = 0.02
 _MOVED_M = (0.3e-6, 1e-6, 3e-6, 10e-6, 30e-6, 100e-6, 500e-6)
 _EDGE_MOVED_M = (0.3e-6, 1e-6, 3e-6, *np.arange(5e-6, 60e-6, 5e-6), *np.geomspace(60e-6, 500e-6, 22))
 """How far an edge may lie elsewhere. Its gain stands out no wider than contacts are deep, however far it has moved:
@@ -138,8 +140,9 @@ class Refiner:
     def _trials(self, term: Term) -> list[Term]:
         """Return a term at amplitudes that move readings or edges by some micrometres.
 
-        Elsewhere, at a few steps about what the column asks for. None of those that its effect can't have: a motor that
-        grows stronger with its force asks for less than no saturation.
+        Elsewhere, at a few steps about what the column asks for: iron that saturates at 360 N asks for 70 times what it
+        does at 3000 N, and was looked for at 200 kN. None of those that its effect can't have: a motor that grows
+        stronger with its force asks for less than no saturation.
         """
         effect = CATALOGUE[term.name]
         amplitude = effect.parameters[0]
@@ -154,7 +157,10 @@ class Refiner:
             sizes = [sign * size_m * unit / max(moves_m, 1e-300) for size_m in tried_m for sign in (1.0, -1.0)]
         else:
             asked = float(self._amplitudes(self._evidence.columns_of(term), term)[0])
-            sizes = [step * max(asked, 0.02) * term.shape[amplitude] for step in _STEPS]
+            here = hypotheses.term_at_size(effect, term.acts_on, shape)
+            power = power_of_size(here, self._evidence.recordings)  # where it is, and none that it has everywhere
+            grown = {max(asked, _LEAST_ASKED) ** (1.0 / p): None for p in (1.0, power)}
+            sizes = [step * share * term.shape[amplitude] for share in grown for step in _STEPS]
         return [
             hypotheses.term_at_size(effect, term.acts_on, shape | {amplitude: size})
             for size in sizes
@@ -397,3 +403,18 @@ def with_shape(term: Term, changed: dict[str, float]) -> Term:
     if term.linear:
         return hypotheses.term_of(effect, term.acts_on, shape)
     return hypotheses.term_at_size(effect, term.acts_on, shape)
+
+
+_GROWN_RATIO = 0.01
+_LEAST_POWER = 0.1
+
+
+def power_of_size(term: Term, recordings: Sequence[Recording]) -> float:
+    """Return the power of its size that an effect follows where it is: -2 of a force at which iron saturates."""
+    name = CATALOGUE[term.name].parameters[0]
+    larger = with_shape(term, {name: term.shape[name] * (1.0 + _GROWN_RATIO)})
+    here, there = (sum(squares_of(f) for r in recordings for f in one.forces(r)) for one in (term, larger))
+    if not (here > 0.0 and there > 0.0):
+        return 1.0
+    power = 0.5 * float(np.log(there / here) / np.log1p(_GROWN_RATIO))
+    return power if abs(power) > _LEAST_POWER else 1.0
