@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from stagectl.gap.findings import Findings, Named, ParameterError
+from stagectl.gap.session_values import own_sd, pooled
 
 Key = tuple[str, str]
 """Name and place."""
@@ -140,6 +141,7 @@ TRANSLATIONS: tuple[Translation, ...] = (
             "breakaway_ratio": _same("static_ratio"),
             "velocity_m_per_s": _same("stribeck_m_per_s"),
             "distance_m": _same("slip_m"),
+            "bristle_damping_s": _same("bristle_damping_s"),
         },
     ),
     Translation(
@@ -316,12 +318,12 @@ def _effects(named: Sequence[Named]) -> list[dict[str, Any]]:
         if translation is None:
             found.append({"name": one.name, "acts_on": acts_on, "alias_set": _aliases(one), "parameters": {}})
             continue
-        values, sds = _plain(one)
+        values, sds, shared = _plain(one)
         aliases = _aliases(one)
         for other in left:
             if other is not one and (other.name, other.acts_on) == (translation.beside, one.acts_on):
-                more, more_sds = _plain(other)
-                values, sds = more | values, more_sds | sds
+                more, more_sds, more_shared = _plain(other)
+                values, sds, shared = more | values, more_sds | sds, more_shared | shared
                 left = [kept for kept in left if kept is not other]
                 found = [kept for kept in found if (kept["name"], kept["acts_on"]) != (other.name, acts_on)]
                 aliases = [alias for alias in aliases if tuple(alias) != (translation.beside, acts_on)]
@@ -334,7 +336,7 @@ def _effects(named: Sequence[Named]) -> list[dict[str, Any]]:
                 "acts_on": acts_on,
                 "alias_set": [alias for alias in aliases if tuple(alias) != own],
                 "parameters": _finite({key: read(values) for key, read in translation.parameters.items()}),
-                "interval": _intervals(translation, values, sds),
+                "interval": _intervals(translation, values, sds, shared),
             }
         )
     return found
@@ -345,25 +347,25 @@ def _aliases(one: Named) -> list[list[str]]:
     return [list(key) for key in keys if key != truth_key(one.name, one.acts_on)]
 
 
-def _plain(one: Named) -> tuple[dict[str, float], dict[str, float]]:
-    """Pool what was fitted session by session, or run by run, into one value each: the truth has one amplitude."""
+def _plain(one: Named) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """Pool what was fitted session by session, or run by run, into one value each: the truth has one amplitude.
+
+    Returns (values, their own deviations, what they are uncertain by together, as ratios).
+    """
     values: dict[str, float] = {}
     sds: dict[str, float] = {}
-    pooled: dict[str, list[tuple[float, float]]] = {}
+    by_name: dict[str, list[tuple[float, float]]] = {}
     for key, value in one.parameters.items():
         name, _, place = key.partition(" of ")
         sd = one.sds.get(key)
-        if not place:
+        if sd is not None:
+            by_name.setdefault(name, []).append((value, sd))
+        elif not place:
             values[name] = value
-            if sd is not None:
-                sds[name] = sd
-        elif sd is not None:
-            pooled.setdefault(name, []).append((value, sd))
-    for name, pairs in pooled.items():
-        weights = [1.0 / max(sd, 1e-300) ** 2 for _, sd in pairs]
-        values[name] = sum(w * value for w, (value, _) in zip(weights, pairs, strict=True)) / sum(weights)
-        sds[name] = 1.0 / math.sqrt(sum(weights))
-    return values, sds
+    for name, pairs in by_name.items():
+        values[name], sd = pooled([value for value, _ in pairs], [sd for _, sd in pairs], one.common_sd_ratio)
+        sds[name] = own_sd(values[name], sd, one.common_sd_ratio)
+    return values, sds, dict.fromkeys(sds, one.common_sd_ratio)
 
 
 def _finite(values: dict[str, float]) -> dict[str, float]:
@@ -371,13 +373,19 @@ def _finite(values: dict[str, float]) -> dict[str, float]:
 
 
 def _intervals(
-    translation: Translation, values: Mapping[str, float], sds: Mapping[str, float]
+    translation: Translation, values: Mapping[str, float], sds: Mapping[str, float], shared: Mapping[str, float]
 ) -> dict[str, tuple[float, float]]:
-    """Carry 95 % intervals over by the slopes of each reading: root of the sum of squares of its parts."""
+    """Carry 95 % intervals over by the slopes of each reading: root of the sum of squares of its parts.
+
+    What all values are uncertain by together is one of the parts: two levels of a friction that are both as uncertain
+    as the scale of forces is have a mean that is no less so, and a ratio that is not.
+    """
     found: dict[str, tuple[float, float]] = {}
+    together = {key: values[key] * (1.0 + ratio) for key, ratio in shared.items() if key in values}
     for name, read in translation.parameters.items():
         centre = read(values)
         parts = [read({**values, key: values[key] + sd}) - centre for key, sd in sds.items() if key in values]
+        parts.append(read({**values, **together}) - centre)
         spread = math.sqrt(sum(part * part for part in parts)) * Z_95
         if math.isfinite(centre) and spread > 0.0 and math.isfinite(spread):
             found[name] = (centre - spread, centre + spread)

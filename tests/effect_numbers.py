@@ -50,8 +50,15 @@ WORKED: dict[str, list[Case]] = {
     ],
     # at the Stribeck speed g = 1 + 1/e: from rest g (1 - exp(-1/g)); at g it stays there
     "lugre_friction": [
-        Case((1e-3, 1e-3, 4.0, 2.0, 1e-3, 1e-6), -1.41876695989130917, (0.0,), (0.70938347994565458,)),
-        Case((1e-3, 1e-3, 4.0, 2.0, 1e-3, 1e-6), -5.47151776468576929, (1.36787944117144232,), (1.36787944117144232,)),
+        Case((1e-3, 1e-3, 4.0, 2.0, 1e-3, 1e-6, 0.0), -1.41876695989130917, (0.0,), (0.70938347994565458,)),
+        Case(
+            (1e-3, 1e-3, 4.0, 2.0, 1e-3, 1e-6, 1e-3),
+            -5.47151776468576929,
+            (1.36787944117144232,),
+            (1.36787944117144232,),
+        ),
+        # half a millisecond of damping beside half the way: as much again
+        Case((1e-3, 1e-3, 4.0, 2.0, 1e-3, 1e-6, 5e-4), -2.83753391978261834, (0.0,), (0.70938347994565458,)),
     ],
     # ---- stiffness ----
     "offset": [Case((12.0, 0.4), 0.4), Case((0.0, -1.5), -1.5)],
@@ -178,7 +185,7 @@ PARAMETERS: dict[str, tuple[float, ...]] = {  # some plausible values, in the or
     "quadratic_drag": (5.0,),
     "load_dependent_friction": (0.02, 1e-3),
     "dahl_friction": (4.0, 5e-6),
-    "lugre_friction": (4.0, 1.4, 5e-3, 5e-6),
+    "lugre_friction": (4.0, 1.4, 5e-3, 5e-6, 3e-4),
     "offset": (0.4,),
     "gravity_tilt": (1e-3,),
     "cable_spring": (2.0, 0.05),

@@ -1,5 +1,6 @@
 """The truth's names and numbers against ours: the table is whole, and both sides mean the same force."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -74,7 +75,7 @@ CASES = [  # truth, place, our parameters, of the effect beside it
     ("micro_reaction", "macro_force", {"fraction_ratio": 0.6}, {}),
     ("dahl_friction", "macro_force", {"level_n": 2.0, "slip_m": 2e-5}, {}),
     ("lugre_friction", "macro_force",
-     {"level_n": 2.0, "static_ratio": 1.5, "stribeck_m_per_s": 5e-3, "slip_m": 2e-5}, {}),
+     {"level_n": 2.0, "static_ratio": 1.5, "stribeck_m_per_s": 5e-3, "slip_m": 2e-5, "bristle_damping_s": 3e-4}, {}),
 ]  # fmt: skip
 
 
@@ -285,6 +286,29 @@ def test_amplitudes_of_sessions_are_pooled():
     assert found["parameters"]["amplitude_n"] == pytest.approx(1.2)
     low, high = found["interval"]["amplitude_n"]
     assert high - low == pytest.approx(2 * 1.96 / math.sqrt(1 / 0.1**2 + 1 / 0.2**2), rel=1e-3)
+
+
+def test_no_mean_is_better_known_than_what_its_parts_have_in_common():
+    """Masses and force constants scale all forces alike: in both sessions, and in both directions."""
+    rippled = named(
+        "cogging",
+        "macro_force",
+        {"amplitude_n of session 0": 1.0, "amplitude_n of session 1": 1.0, "pitch_m": 0.02},
+        dict.fromkeys(("amplitude_n of session 0", "amplitude_n of session 1"), 5e-3),
+    )
+    rubbing = named(
+        "asymmetric_coulomb_friction",
+        "macro_force",
+        {"forward_n": 3.0, "backward_n": 1.0, "smoothing_m_per_s": 1e-5},
+        {"forward_n": 0.015, "backward_n": 0.005},
+    )
+    one, other = (translated(dataclasses.replace(effect, common_sd_ratio=4e-3))[0] for effect in (rippled, rubbing))
+    half_width = 1.96 * math.hypot(4e-3, 3e-3 / math.sqrt(2.0))
+    assert one["interval"]["amplitude_n"] == pytest.approx((1.0 - half_width, 1.0 + half_width), rel=1e-4)
+    half_width = 1.96 * math.hypot(8e-3, 0.5 * 9e-3, 0.5 * 3e-3)
+    assert other["interval"]["level_n"] == pytest.approx((2.0 - half_width, 2.0 + half_width), rel=1e-4)
+    low, high = other["interval"]["asymmetry"]
+    assert high - low == pytest.approx(2.0 * 1.96 * math.hypot(9e-3 / 8.0, 3.0 * 3e-3 / 8.0), rel=0.01)
 
 
 @pytest.mark.parametrize("value", [0.0, -1e9, 1e9, float("inf"), float("nan")])

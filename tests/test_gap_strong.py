@@ -19,8 +19,8 @@ from stagectl.gap.log import Log
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group, solve
 from stagectl.gap.recording import Recording
-from stagectl.gap.refinement import Refiner
-from stagectl.gap.settling import _resized, power_of_size
+from stagectl.gap.refinement import Refiner, power_of_size
+from stagectl.gap.settling import _resized
 
 H, STEPS, MASS, NOISE_M = 1e-3, 10, 40.0, 5e-9
 DURATION_S = 8.0
@@ -192,6 +192,58 @@ def test_a_search_of_shapes_that_depend_on_each_other_ends_where_they_are():
     assert outcome is not None
     true = {"share_ratio": 0.15, "frequency_hz": 18.8, "damping_ratio": 0.033}
     assert outcome[0].shape == pytest.approx(true, rel=0.01)
+
+
+def test_bristles_are_searched_with_their_damping():
+    """From a place of the grid, where all four shapes are off: line by line their damping stays a third off."""
+    true = {"static_ratio": 1.4, "stribeck_m_per_s": 2e-3, "slip_m": 17e-6, "bristle_damping_s": 9e-4}
+
+    def rubbed_by(memory: np.ndarray) -> Callable[[float, float, float], float]:
+        law = CATALOGUE["lugre_friction"].law
+        return lambda command_n, x, v: command_n + law(v, H / STEPS, 2.0, *true.values(), memory)
+
+    recordings = [balance.recording_of(_axis_under(rubbed_by(np.zeros(1)), seed), AXIS) for seed in (1, 2)]
+    for recording in recordings:
+        balance.set_noise(recording, slow_noise(AXIS, recording))
+    evidence = Evidence(recordings)
+    evidence.finish(np.zeros(0), 0, 0)
+    off = {"static_ratio": 1.5, "stribeck_m_per_s": 3e-3, "slip_m": 2e-5, "bristle_damping_s": 3e-4}
+    outcome = Refiner(evidence, []).refined(hypotheses.term_of(CATALOGUE["lugre_friction"], "macro_force", off))
+    assert outcome is not None
+    found = outcome[0].shape
+    assert found.pop("bristle_damping_s") == pytest.approx(9e-4, abs=H / STEPS)  # a force is known within a step
+    assert found == {name: pytest.approx(true[name], rel=0.02) for name in found}
+
+
+@pytest.mark.parametrize("seed_n", [150.0, 3000.0])
+def test_iron_that_saturates_is_found_from_any_place_of_the_grid(seed_n):
+    """All places have one column, and which of them is taken first is chance: 3000 N asked for 200 times as much."""
+
+    def saturating_n(command_n: float, x: float, v: float) -> float:
+        return command_n + CATALOGUE["force_constant_saturation"].law(command_n, 200.0)
+
+    recordings = [balance.recording_of(_axis_under(saturating_n, seed), AXIS) for seed in (1, 2)]
+    for recording in recordings:
+        balance.set_noise(recording, slow_noise(AXIS, recording))
+    evidence = Evidence(recordings)
+    evidence.finish(np.zeros(0), 0, 0)
+    term = hypotheses.term_of(CATALOGUE["force_constant_saturation"], "macro_actuator", {"saturation_n": seed_n})
+    outcome = Refiner(evidence, []).refined(term)
+    assert outcome is not None
+    assert outcome[0].shape["saturation_n"] == pytest.approx(200.0, rel=0.01)
+
+
+def test_what_asks_for_a_size_that_no_effect_can_have_stays_as_it_is():
+    """An axis that stands is read 0.3 um elsewhere by no delay that a sensor can have."""
+    random = np.random.default_rng(4)
+    count = round(2.0 / H)
+    log = Log("run", H, NOISE_M * random.standard_normal(count), np.zeros(count), np.ones(count, bool), "one")
+    recording = balance.recording_of(log, AXIS)
+    balance.set_noise(recording, slow_noise(AXIS, recording))
+    refiner = Refiner(Evidence([recording]), [])
+    term = hypotheses.term_of(CATALOGUE["sensor_delay"], "macro_sensor", {"delay_s": 3e-4})
+    assert refiner.refined(term) is None
+    assert refiner.gain_at_size(term) == 0.0
 
 
 SHARE, MODE_HZ, MODE_DAMPING = 0.06, 22.0, 0.02

@@ -158,21 +158,23 @@ def dahl_friction(velocity_m_per_s, dt_s, level_n, slip_m, memory):
     static_ratio=(1.0, 5.0),
     stribeck_m_per_s=(1e-6, 1.0),
     slip_m=(1e-8, 1e-3),
+    bristle_damping_s=(0.0, 1e-2),
     linear=("level_n",),
-    searched=("slip_m", "static_ratio", "stribeck_m_per_s"),
+    searched=("slip_m", "static_ratio", "stribeck_m_per_s", "bristle_damping_s"),
     shown_by="low speed",
     symptom="a spring over the first micrometres after each reversal, a peak at break-away, then Coulomb friction",
     reference="Canudas de Wit, Olsson, Astrom, Lischinsky, IEEE Trans. Automatic Control 40(3), 1995, (1)-(3)",
 )
-def lugre_friction(velocity_m_per_s, dt_s, level_n, static_ratio, stribeck_m_per_s, slip_m, memory):
-    """Friction of bristles (LuGre): F = -F_c z, dz/dt = (v - |v| z / g) / delta, g = 1 + (r - 1) exp(-(v / v_S)^2).
+def lugre_friction(velocity_m_per_s, dt_s, level_n, static_ratio, stribeck_m_per_s, slip_m, bristle_damping_s, memory):
+    """Friction of bristles: F = -F_c (z + T dz/dt), dz/dt = (v - |v| z / g) / delta, g = 1 + (r - 1) exp(-(v / v_S)^2).
 
-    With z in units of F_c / sigma_0 = delta (`slip_m`) and r = F_s / F_c; the damping sigma_1 of the bristles is left
-    out, sigma_2 is `viscous_friction`. memory: z. Its step is exact for constant v, so it can't diverge as Euler's.
+    LuGre with z in units of F_c / sigma_0 = delta (`slip_m`), r = F_s / F_c and T = sigma_1 / sigma_0; sigma_2 is
+    `viscous_friction`. memory: z. Its step is exact for constant v, so it can't diverge as Euler's.
     """
     z = memory[0]
     ratio = velocity_m_per_s / stribeck_m_per_s
     g = 1.0 + (static_ratio - 1.0) * np.exp(-ratio * ratio)
     goal = g if velocity_m_per_s >= 0.0 else -g
     memory[0] = goal + (z - goal) * np.exp(-abs(velocity_m_per_s) * dt_s / (slip_m * g))
-    return -0.5 * level_n * (z + memory[0])
+    rate_per_s = (velocity_m_per_s - abs(velocity_m_per_s) * z / g) / slip_m if dt_s <= 0.0 else (memory[0] - z) / dt_s
+    return -level_n * (0.5 * (z + memory[0]) + bristle_damping_s * rate_per_s)

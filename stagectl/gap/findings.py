@@ -23,6 +23,7 @@ class Named:
     held_out_gain: float
     aliases: tuple[tuple[str, str, float], ...]
     confirmed: bool = False
+    common_sd_ratio: float = 0.0  # what all of `sds` hold in common: of the scale of forces; 0 in older findings
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,9 @@ from stagectl.gap.hypotheses import Term
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.quantities import along_motion, in_order, quantities
 from stagectl.gap.recording import Recording
+from stagectl.gap.refinement import power_of_size
 from stagectl.gap.selection import CONTRADICTION
-from stagectl.gap.settling import power_of_size, settled_by
+from stagectl.gap.settling import settled_by
 
 
 def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
@@ -28,13 +29,14 @@ def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
         if term.acts_on == "parameter":
             continue
         rest = judge.gains([other for other in chosen if other is not group])
-        parameters, errors = _sized(search, solution, group)
+        parameters, sds, common = _sized(search, solution, group)
         found.append(
             Named(
                 name=term.name,
                 acts_on=term.acts_on,
                 parameters=parameters,
-                sds=errors,
+                sds=sds,
+                common_sd_ratio=common,
                 gain=whole[0] - rest[0],
                 held_out_gain=whole[1] - rest[1],
                 aliases=tuple((*key, margin) for key, margin in judge.aliases(chosen, group)),
@@ -54,19 +56,22 @@ def measured(
         if group is None:
             found.append(one)
         else:
-            parameters, sds = _sized(search, solution, group)
-            found.append(replace(one, parameters=parameters, sds=sds))
+            parameters, sds, common = _sized(search, solution, group)
+            found.append(replace(one, parameters=parameters, sds=sds, common_sd_ratio=common))
     return tuple(found)
 
 
-def _sized(search: Competition, solution: Solution, group: Group) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the parameters of an effect, and the deviations of those that were solved for."""
+def _sized(search: Competition, solution: Solution, group: Group) -> tuple[dict[str, float], dict[str, float], float]:
+    """Return the parameters of an effect, the deviations of those that were solved for, and their common share."""
     term = search.term(group)
-    parameters, errors = _readable(term, *solution.of(group), _places(solution, group))
-    if not term.linear and term.is_slope:
-        return parameters, errors
-    parameters, errors = _in_true_force(search, solution, term, parameters, errors)
-    return (term.shape | parameters if term.linear else parameters), errors
+    parameters, slopes = _readable(term, solution, group)
+    scale = np.zeros(len(solution.slots))
+    if term.linear or not term.is_slope:
+        scale = _scale_of_forces(search, solution, term)
+    factor = 1.0 + float(scale @ solution.values)
+    parameters |= {name: factor * parameters[name] for name in slopes}
+    sds = {name: solution.sd_of(factor * slope + parameters[name] * scale) for name, slope in slopes.items()}
+    return (term.shape | parameters if term.linear else parameters), sds, solution.sd_of(scale)
 
 
 _MOTOR_QUANTITIES = {
@@ -88,10 +93,8 @@ def _right_share(search: Competition) -> float:
     return right / whole if whole > 0.0 else 0.5
 
 
-def _in_true_force(
-    search: Competition, solution: Solution, term: Term, parameters: dict[str, float], errors: dict[str, float]
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return amplitudes and deviations with what the scale of forces is off, and uncertain, by.
+def _scale_of_forces(search: Competition, solution: Solution, term: Term) -> np.ndarray:
+    """Return by what known parameters scale the amplitudes of a term: a share of each slot's value, shape (slots,).
 
     A motion shows forces over masses: with a mass that is e too large in truth every force is, and the masses are known
     to what is stated of them and of the force constants. Levels came out 0.3 to 1.2 % off, eight deviations. What is
@@ -100,8 +103,9 @@ def _in_true_force(
     the power of it that the law follows: what saturates with the square of a motor's force, by 1.5 times what the force
     constant is off by.
     """
+    vector = np.zeros(len(solution.slots))
     if term.acts_on.endswith(("_sensor", "_command", "contact_edge")):
-        return parameters, errors
+        return vector
     side = "macro" if term.acts_on.startswith("macro") else "micro"
     quantities = CATALOGUE[term.name].quantities
     weights = {} if "mass_kg" in quantities else {f"{side}_mass_kg": 1.0}
@@ -121,12 +125,9 @@ def _in_true_force(
         for (known, _), group in zip(search.parameters, search.judge.base, strict=False)
         if known.name in weights
     }
-    vector = np.zeros(len(solution.slots))
     for name, column in columns.items():
         vector[[slot for slot, (number, _) in enumerate(solution.slots) if number == column]] = weights[name]
-    off, uncertain = float(vector @ solution.values), solution.sd_of(vector)
-    scaled = {name: value * (1.0 + off) if name in errors else value for name, value in parameters.items()}
-    return scaled, {name: float(np.hypot(sd, scaled[name] * uncertain)) for name, sd in errors.items()}
+    return vector
 
 
 _SCALED_RATIO = 0.01
@@ -147,41 +148,35 @@ def _power_of_motor(search: Competition, term: Term, quantity: str) -> float:
     return 0.5 * float(np.log(squares[1] / squares[0]) / np.log1p(_SCALED_RATIO)) if min(squares) > 0.0 else 1.0
 
 
-def _places(solution: Solution, group: Group) -> list[str]:
-    """Name the sessions or runs that the values of a group belong to, in their order; one empty name where to none."""
-    return [scope for column, scope in solution.slots if column == group.columns[0]]
+def _readable(term: Term, solution: Solution, group: Group) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """Turn pairs of a sine and a cosine into amplitude and phase, session by session, and a share into its value.
 
-
-def _readable(
-    term: Term, values: np.ndarray, sds: np.ndarray, places: list[str]
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Turn pairs of a sine and a cosine into amplitude and phase, session by session, and a share into its value."""
+    Returns (parameters, slopes over all slots of those that were solved for).
+    """
     parameters: dict[str, float] = {}
-    errors: dict[str, float] = {}
-    per = len(term.amplitudes)
-    if not term.linear:
-        (first, at), *rest = term.shape.items()
-        for place, value, sd in zip(places, values, sds, strict=True):
-            mark = f" of {place}" if place else ""
-            parameters[first + mark] = float(value) * at
-            errors[first + mark] = float(sd) * abs(at)
-        return parameters | dict(rest), errors
-    for number, place in enumerate(places):
+    slopes: dict[str, np.ndarray] = {}
+    axes = np.eye(len(solution.slots))
+    slots = [[k for k, (number, _) in enumerate(solution.slots) if number == column] for column in group.columns]
+    for here in zip(*slots, strict=True):
+        place = solution.slots[here[0]][1]
         mark = f" of {place}" if place else ""
-        here, sd = values[number * per : (number + 1) * per], sds[number * per : (number + 1) * per]
-        if all(name.endswith("*") for name in term.amplitudes):
-            effect = CATALOGUE[term.name]
-            for pair in range(0, per, 2):
+        values = [float(solution.values[slot]) for slot in here]
+        if not term.linear:
+            first, at = next(iter(term.shape.items()))
+            parameters[first + mark] = values[0] * at
+            slopes[first + mark] = at * axes[here[0]]
+        elif all(name.endswith("*") for name in term.amplitudes):
+            for pair in range(0, len(values), 2):
                 name = term.amplitudes[pair].removesuffix("*")
-                phase = hypotheses.phase_of(effect, name)
-                parameters[name + mark] = float(np.hypot(here[pair], here[pair + 1]))
-                parameters[f"{phase}{mark}"] = float(np.arctan2(here[pair + 1], here[pair]))
-                errors[name + mark] = float(np.mean(sd[pair : pair + 2]))
+                angle = float(np.arctan2(values[pair + 1], values[pair]))
+                parameters[name + mark] = float(np.hypot(values[pair], values[pair + 1]))
+                parameters[f"{hypotheses.phase_of(CATALOGUE[term.name], name)}{mark}"] = angle
+                slopes[name + mark] = np.cos(angle) * axes[here[pair]] + np.sin(angle) * axes[here[pair + 1]]
         else:
-            for name, value, one in zip(term.amplitudes, here, sd, strict=True):
-                parameters[name + mark] = float(value)
-                errors[name + mark] = float(one)
-    return parameters, errors
+            for name, value, slot in zip(term.amplitudes, values, here, strict=True):
+                parameters[name + mark] = value
+                slopes[name + mark] = axes[slot]
+    return (parameters if term.linear else parameters | dict(list(term.shape.items())[1:])), slopes
 
 
 def parameter_errors(search: Competition, chosen: list[Group], solution: Solution) -> tuple[ParameterError, ...]:
@@ -293,10 +288,9 @@ def refitted_errors(
             for name in hypotheses.parts_of(term.name):
                 groups[name].append(group)
     found = {name: solution.total_of(summed) for name, summed in groups.items()}
-    if not search.moved:
-        for name, change in settled_by(believed, search.evidence.recordings[0]).items():
-            value, sd = found[name]
-            found[name] = value + change, sd
+    for name, change in settled_by(believed, search.evidence.recordings[0]).items():
+        value, sd = found[name]
+        found[name] = value + change, sd
     for wrong in widths:
         for name in hypotheses.parts_of(wrong.name):
             value, sd = found[name]

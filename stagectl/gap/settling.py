@@ -18,13 +18,12 @@ from stagectl.gap.contact import CONTACT_DAMPING, contact_damping_n_s_per_m
 from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.evidence import Evidence, Scales
 from stagectl.gap.findings import Named
-from stagectl.gap.forces import squares_of
 from stagectl.gap.hypotheses import DEVIATION_SD, Term, widest_amplitudes
 from stagectl.gap.innovations import Noise
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.operating_point import Moved, operating_point, with_joint_changed
 from stagectl.gap.recording import Recording
-from stagectl.gap.refinement import LATCH_SDS, whole_of, with_shape
+from stagectl.gap.refinement import LATCH_SDS, power_of_size, whole_of
 from stagectl.gap.selection import Judge
 
 _EDGE_PASSES = 3
@@ -177,25 +176,10 @@ def _resized(term: Term, share: float, recordings: Sequence[Recording]) -> Term:
     )
 
 
-_GROWN_RATIO = 0.01
-_LEAST_POWER = 0.1
-
-
 def _grown(term: Term, share: float, recordings: Sequence[Recording]) -> float:
     """Return the size at which an effect does `share` times what it does."""
     size = term.shape[CATALOGUE[term.name].parameters[0]]
     return size * max(share, 0.0) ** (1.0 / power_of_size(term, recordings))
-
-
-def power_of_size(term: Term, recordings: Sequence[Recording]) -> float:
-    """Return the power of its size that an effect follows where it is: -2 of a force at which iron saturates."""
-    name = CATALOGUE[term.name].parameters[0]
-    larger = with_shape(term, {name: term.shape[name] * (1.0 + _GROWN_RATIO)})
-    here, there = (sum(squares_of(f) for r in recordings for f in one.forces(r)) for one in (term, larger))
-    if not (here > 0.0 and there > 0.0):
-        return 1.0
-    power = 0.5 * float(np.log(there / here) / np.log1p(_GROWN_RATIO))
-    return power if abs(power) > _LEAST_POWER else 1.0
 
 
 def _changed(moved: Moved, ratio: float) -> Moved:
