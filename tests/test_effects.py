@@ -102,13 +102,14 @@ def test_finite_within_its_bounds(name, data):
     known = CATALOGUE[name]
     limits = {"position_m": 1.0, "velocity_m_per_s": 2.0, "acceleration_m_per_s2": 50.0, "mass_kg": 1e3}
     limits |= {"motor_force_n": 5e3, "penetration_m": 1e-3, "contact_stiffness_n_per_m": 1e7, "t_s": 1e5, "dt_s": 0.1}
+    limits |= {"current_loop_s": 0.02}
     parameters = [data.draw(st.floats(low, high)) for low, high in known.bounds.values()]
     memory = np.zeros(known.memory)
     for _ in range(5):
         quantities = []
         for key in known.quantities:
             high = limits.get(key, 1.0)
-            positive = key in ("mass_kg", "t_s", "dt_s", "penetration_m", "contact_stiffness_n_per_m")
+            positive = key in ("mass_kg", "t_s", "dt_s", "penetration_m", "contact_stiffness_n_per_m", "current_loop_s")
             quantities.append(data.draw(st.floats(0.0 if positive else -high, high)))
         assert math.isfinite(called(known.compiled_law, (*quantities, *parameters), memory))
         assert np.all(np.isfinite(memory))
