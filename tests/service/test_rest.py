@@ -7,19 +7,13 @@ from stagectl.record import read_run
 from stagectl.requests import Phase
 from stagectl.service import messages
 from tests.service.test_stage_loop import Bench
-from tests.struck_stage import home_by_truth
 
 
 @pytest.fixture
 def armed(tmp_path):
     """An armed stage in virtual time, homed by what the rig knows."""
     bench = Bench(tmp_path, "oled-printer")
-    bench.loop.show()
-    bench.until(lambda: bench.status.state == "idle")
-    home_by_truth(bench.loop._stage, bench.loop._stage.backend.rig.plant_state())
-    bench.loop._homed = True
-    bench.take()
-    assert bench.do("arm", messages.Arm()).stop == "FINISHED"
+    bench.hold_as_homed_by_truth()
     yield bench
     bench.loop.leave()
     bench.loop.run()

@@ -21,6 +21,7 @@ from stagectl.service.service_log import ServiceLog
 from stagectl.service.stage_loop import StageLoop
 from stagectl.service.stage_state import Settings
 from stagectl.signals import Stop
+from tests.struck_stage import home_by_truth
 from tests.toml_text import changed
 
 pytestmark = pytest.mark.real_time
@@ -65,6 +66,15 @@ class Bench:
         key = self.begin(name, body)
         self.until(lambda: self.desk.command(key).state in ("done", "failed"))
         return self.desk.command(key)
+
+    def hold_as_homed_by_truth(self):
+        """Connect, take the lease and arm, with the zeros that the rig knows: a homing of 10 s less."""
+        self.loop.show()
+        self.until(lambda: self.status.state == "idle")
+        home_by_truth(self.loop._stage, self.loop._stage.backend.rig.plant_state())
+        self.loop._homed = True
+        self.take()
+        assert self.do("arm", messages.Arm()).stop == "FINISHED"
 
     def inject(self, *faults):
         backend = self.loop._stage.backend

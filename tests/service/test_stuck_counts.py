@@ -3,9 +3,7 @@
 import pytest
 
 from sim_backend.faults import Fault
-from stagectl.service import messages
 from tests.service.test_stage_loop import Bench
-from tests.struck_stage import home_by_truth
 
 STUCK_S = 0.2
 WATCHED_S = 0.5
@@ -15,12 +13,7 @@ WATCHED_S = 0.5
 def held(request, tmp_path):
     """An armed stage in virtual time, at rest."""
     bench = Bench(tmp_path, request.param)
-    bench.loop.show()
-    bench.until(lambda: bench.status.state == "idle")
-    home_by_truth(bench.loop._stage, bench.loop._stage.backend.rig.plant_state())
-    bench.loop._homed = True
-    bench.take()
-    assert bench.do("arm", messages.Arm()).stop == "FINISHED"
+    bench.hold_as_homed_by_truth()
     yield bench
     bench.loop.leave()
     bench.loop.run()
