@@ -9,6 +9,7 @@ from stagectl import trajectory as trajectories
 from stagectl.backlash import HOLD_RATIO, filter_time_s
 from stagectl.errors import DriveError, LinkError, RequestError
 from stagectl.outcome import BacklashEstimate, Outcome
+from stagectl.profile import MacroAxis, MicroAxis
 from stagectl.requests import Mode, Phase
 from stagectl.session import WATCHED_ONLY
 from stagectl.signals import Stop, stop_sentence
@@ -147,7 +148,7 @@ class Homing(StreamMotion):
             raise RequestError(WATCHED_ONLY)
         method = self._homing_method()
         stop = self._search(method)
-        if stop is not Stop.DRIVE_FAULT or method not in _INDEX_METHODS or self._failed(self.status()):
+        if stop is not Stop.HOMING_GIVEN_UP or method not in _INDEX_METHODS or self._failed(self.status()):
             return stop
         other = _INDEX_METHODS[1 - _INDEX_METHODS.index(method)]
         self._event("homing_turned", method=method, other=other, text=self.detail)
@@ -260,11 +261,24 @@ class Homing(StreamMotion):
             centre_m=float(status["setpoint_position_m"]),
             dt_s=1.0 / self.profile.cycle.rate_hz,
         )
+        _check_sweep(planned, self.profile.macro, self.profile.micro)
         return self.follow(planned.setpoints, name)
 
     def identify(self, frequency_hz: float | None = None, duration_s: float = 20.0) -> Outcome:
         """Identify the backlash from a sweep over both contacts; without a frequency, one that suits the joint."""
         return self.sweep(IDENTIFY_SHARE, IDENTIFY_HZ, duration_s, "identifying the backlash", frequency_hz)
+
+
+def _check_sweep(planned: trajectories.Trajectory, macro: MacroAxis, micro: MicroAxis) -> None:
+    """Refuse a sweep that the end can't follow; the macro stands, so its travel says nothing."""
+    trajectories.check(
+        planned,
+        (-math.inf, math.inf),
+        macro.velocity_limit_m_per_s,
+        macro.acceleration_limit_m_per_s2,
+        loads=(trajectories.Load("micro", micro.mass_kg, micro.force_limit_n, micro.damping_n_s_per_m),),
+        stroke_m=micro.stroke_m,
+    )
 
 
 def _refuse_no_joint(estimate: BacklashEstimate) -> None:

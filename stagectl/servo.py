@@ -137,6 +137,7 @@ class Servo:
         layout: Any = ROW.fields  # its keys are typed as literals
         self._offsets = {name: layout[name][1] for name in ROW.names or ()}
         self._homing_id = 0
+        self._searches = False  # the macro's drive has power for its homing
         self._stated_text = ""
         self._status = np.zeros(1, STATUS)
         self._status["error_m"] = np.nan  # until a line was there
@@ -419,6 +420,7 @@ class Servo:
                 if stop is not Stop.NONE:
                     self._end(stop, Phase.STOPPED, t_ns, text)
                 else:
+                    self._searches = False
                     self._enter(Phase.ENABLING if mode is Mode.TRACK else Phase.HOMING_DRIVE, t_ns)
             elif mode is Mode.IDLE:
                 self._enter(Phase.IDLE, t_ns)
@@ -562,18 +564,20 @@ class Servo:
         if stop is not Stop.NONE:
             self._end(stop, Phase.QUICK_STOP, t_ns, text)
             return cia402.State.QUICK_STOP_ACTIVE, off
-        homed = self.phase is Phase.HOMED_DRIVE  # one that let go by itself would search again
-        if state in (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE) or (homed and state is not on):
+        homed = self.phase is Phase.HOMED_DRIVE
+        # One that let go by itself would be walked up again, and search again.
+        if state in (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE) or (self._searches and state is not on):
             self._end(Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns, self._detail(Stop.DRIVE_FAULT))
             return cia402.State.QUICK_STOP_ACTIVE, off
+        self._searches = state is on
         if not homed and state is on and (t_ns - self._phase_since_t_ns) * 1e-9 > 0.05:
             progress = cia402.homing_of(seen.macro_statusword)
             if progress is cia402.Homing.ATTAINED:
                 self._enter(Phase.HOMED_DRIVE, t_ns)
                 return on, off
             if progress in (cia402.Homing.ERROR, cia402.Homing.ERROR_MOVING):
-                text = "the macro's drive gave its homing up; check index, limit switches and macro.homing"
-                self._end(Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns, text)
+                text = "no index on this side; check index, limit switches and macro.homing"
+                self._end(Stop.HOMING_GIVEN_UP, Phase.QUICK_STOP, t_ns, text)
                 return cia402.State.QUICK_STOP_ACTIVE, off
         return on, off
 

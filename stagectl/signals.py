@@ -104,6 +104,7 @@ class Stop(IntEnum):
     RECORD_LOST = 23
     SAMPLE_AHEAD = 24
     STARVED = 25
+    HOMING_GIVEN_UP = 26
 
 
 STOP_TEXT = {
@@ -133,6 +134,7 @@ STOP_TEXT = {
     Stop.RECORD_LOST: "the run can't be written to its disk",
     Stop.SAMPLE_AHEAD: "the newest interferometer sample lies in the future",
     Stop.STARVED: "the set-points did not come in time: the stage braked to rest and holds",
+    Stop.HOMING_GIVEN_UP: "the macro's drive gave its homing up",
 }
 
 

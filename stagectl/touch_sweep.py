@@ -54,7 +54,7 @@ def plan(
     """Plan a sweep that presses both sides with `force_share` of the touch force, and never with more than all of it.
 
     Without `asked_hz` it runs at `usual_hz`, or slower where the joint asks for it, and then long enough to swing five
-    times. RequestError where `asked_hz` would press too hard.
+    times. RequestError where `asked_hz` would press too hard, or might: where nobody says how the joint is damped.
     """
     half_m = 0.5 * (joint.left_m + joint.right_m)
     stiffest = max(joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m)
@@ -70,6 +70,12 @@ def plan(
         if usual_hz <= limit_hz:
             return TouchSweep(amplitude_m, usual_hz, duration_s)
         return TouchSweep(amplitude_m, limit_hz, max(duration_s, _LEAST_SWINGS / limit_hz))
+    if joint.damping_n_s_per_m == 0.0 and not asked_hz <= usual_hz:
+        raise RequestError(
+            f"frequency_hz = {asked_hz:g}: the profile says no damping of the joint, and faster than {usual_hz:g} Hz "
+            f"it may be pressed harder than backlash.touch_force_n = {joint.touch_force_n:g} N; ask for at most "
+            f"{usual_hz:g} Hz, or give the effect contact_damping"
+        )
     if not asked_hz <= limit_hz:
         raise RequestError(
             f"frequency_hz = {asked_hz:g}: with a gap of {2e3 * half_m:g} mm and {joint.damping_n_s_per_m:g} N s/m the "

@@ -94,6 +94,42 @@ def test_a_drive_that_lets_go_after_its_homing_gets_no_power_again(cause, tmp_pa
     assert np.ptp(rows["macro_encoder_m"][held[0] :]) < 0.5e-3  # it stays there, and is not sent off again
 
 
+def test_a_drive_that_lets_go_in_its_search_gets_no_power_again(tmp_path, single_profile, single_machine):
+    """Somebody else disables its voltage for a moment, or its power stage drops out without a word of why."""
+    backend = BatchBackend(single_machine, seed=1)
+    struck = False
+
+    def strike(rows):
+        nonlocal struck
+        moves = np.abs(np.diff(rows["macro_encoder_m"])) > 1e-5
+        if not struck and Phase.HOMING_DRIVE in rows["run_phase"] and moves.any():
+            struck = True
+            fault = Fault("object_change", node_id=MACRO, index=cia402.CONTROLWORD, subindex=0, value=0)
+            backend.rig.inject(fault, backend.wire.t_ns)
+
+    with Supervisor(single_profile, backend, tmp_path / "run", observe=strike) as stage:
+        outcome = stage.home()
+        stage.pump(0.5)
+    assert struck
+    assert outcome.stop is Stop.DRIVE_FAULT
+    rows = read_run(tmp_path / "run").rows
+    states = [cia402.state_of(int(word)) for word in rows["macro_statusword"]]
+    powered = np.array([state is cia402.State.OPERATION_ENABLED for state in states])
+    searched = np.flatnonzero(powered)
+    assert np.ptp(searched) + 1 == searched.size  # once
+    assert not rows["homing_id"].any()
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_an_index_on_the_other_side_is_found(side, tmp_path, single_profile, single_machine):
+    """A drive that gives its search up has said so itself: it is asked to look on the other side."""
+    machine = with_values(single_machine, start__macro_position_m=side * 0.05)
+    with Supervisor(single_profile, BatchBackend(machine, seed=1), tmp_path / "run") as stage:
+        assert stage.home().finished
+    turned = [event for event in read_run(tmp_path / "run").events if event["event"] == "homing_turned"]
+    assert len(turned) == (1 if side < 0.0 else 0)
+
+
 def dark_at(there, tmp_path, profile, machine):
     """A stage whose macro's drive loses its power for good as soon as `there` holds of the newest rows."""
     backend = BatchBackend(machine, seed=1)

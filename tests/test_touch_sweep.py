@@ -65,6 +65,13 @@ def test_a_joint_without_damping_sets_no_speed():
     assert touch_sweep.plan(KANG._replace(damping_n_s_per_m=0.0), TOUCH_SHARE, TOUCH_HZ, TOUCH_S)[1:] == (0.7, 6.0)
 
 
+def test_a_speed_beyond_the_usual_is_refused_where_nobody_says_how_the_joint_is_damped():
+    unknown = KANG._replace(damping_n_s_per_m=0.0)
+    with pytest.raises(RequestError, match=r"frequency_hz = 5: .*at most 1 Hz, or give the effect contact_damping"):
+        touch_sweep.plan(unknown, IDENTIFY_SHARE, IDENTIFY_HZ, 20.0, 5.0)
+    assert touch_sweep.plan(unknown, IDENTIFY_SHARE, IDENTIFY_HZ, 20.0, 1.0).frequency_hz == 1.0
+
+
 def test_a_speed_that_presses_too_hard_is_refused_with_the_one_that_does_not():
     with pytest.raises(
         RequestError, match=r"frequency_hz = 1: .*15 mm.*touch_force_n = 4 N; ask for at most 0\.208 Hz"

@@ -27,6 +27,7 @@ _REMEDY = {
     Stop.LINK_LOST: "check the cable, then acknowledge: the stage is opened anew",
     Stop.HEARTBEAT_LOST: "check the drive's power and firmware, then acknowledge",
     Stop.RECORD_LOST: "free space on the disk of the runs, then acknowledge",
+    Stop.HOMING_GIVEN_UP: "check index, limit switches and macro.homing, acknowledge, then home",
     Stop.SAMPLE_AHEAD: "check interferometer.rate_hz and the host's clock, then acknowledge",
 }
 

@@ -6,6 +6,7 @@ Homing does not: a stage that nobody watched may be anywhere.
 
 import json
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,22 +80,33 @@ class Memory:
     def __init__(self, folder: Path, remembered: Remembered, refused: Callable[[str], None]):
         """Go on from what was recalled; `refused` hears what the disk says."""
         self._folder, self.now, self._refused = folder, remembered, refused
+        self._writes = threading.Lock()
 
     def keep(self, **changes: Any) -> None:
-        """Change some of it."""
+        """Change some of it, and wait for the disk: for a stage that nobody moves."""
         self.now = self.now.model_copy(update=changes)
-        try:
-            keep(self._folder, self.now)
-        except RecordError as error:
-            self._refused(str(error))
+        self._write()
+
+    def _write(self) -> None:
+        with self._writes:
+            try:
+                keep(self._folder, self.now)
+            except RecordError as error:
+                self._refused(str(error))
 
     def joint(self, backend: str, profile_name: str) -> Backlash | None:
         """Return what a joint was when it was identified last; None where nobody did."""
         return self.now.joints.get(f"{backend} {profile_name}")
 
     def keep_joint(self, found: Backlash) -> None:
-        """Keep what a joint was identified as, beside those of other worlds."""
-        self.keep(joints={**self.now.joints, f"{found.backend} {found.profile_name}": found})
+        """Keep what a joint was identified as, beside those of other worlds; the disk is not waited for.
+
+        The stage may have power: a disk that took half a second longer than usual would stop it, SUPERVISOR_SILENT.
+        """
+        self.now = self.now.model_copy(
+            update={"joints": {**self.now.joints, f"{found.backend} {found.profile_name}": found}}
+        )
+        threading.Thread(target=self._write, name="memory", daemon=True).start()
 
     @property
     def next_fault_number(self) -> int:

@@ -6,7 +6,7 @@ Clients reach it through `Desk`; nothing here waits for one of them, and nothing
 import time
 from collections.abc import Callable
 
-from stagectl.errors import DriveError, RequestError, StagectlError
+from stagectl.errors import DriveError, LinkError, ProfileError, RequestError, StagectlError
 from stagectl.outcome import Outcome
 from stagectl.profile import load_profile
 from stagectl.requests import Phase
@@ -229,8 +229,14 @@ class StageLoop(StageWatch):
     def _do_backend(self, order: Order) -> None:
         if self._state not in (State.OFF, State.IDLE):
             raise RequestError(f"the world can be changed without power only; the state is {self._state}: stop first")
-        profile = self._profile if self._profile is not None else load_profile(self._profile_asked)
-        chosen = choose(profile, order.body.backend)
+        try:
+            profile = self._profile if self._profile is not None else load_profile(self._profile_asked)
+            chosen = choose(profile, order.body.backend)
+        except (
+            ProfileError,
+            LinkError,
+        ) as error:  # of what was asked for: the world that is open is as sound as before
+            raise RequestError(str(error)) from error
         self._log.say("backend", BANNERS[chosen], backend=chosen, asked=order.body.backend, before=self._backend)
         if chosen != self._backend:
             asked, began_with = order.body.backend, self.settings.backend
@@ -247,6 +253,9 @@ class StageLoop(StageWatch):
     def _do_reread(self, order: Order) -> None:
         if self._state not in (State.OFF, State.IDLE):
             raise RequestError(f"the profile is read again without power only; the state is {self._state}: stop first")
-        load_profile(self._profile_asked)
+        try:
+            load_profile(self._profile_asked)
+        except ProfileError as error:
+            raise RequestError(f"kept as it was: {error}") from error
         self._reread()
         self._finish(order, "the profile was read again")

@@ -67,6 +67,7 @@ class StageState:
         self._waiting_for = "the service has just begun"
         self._retry_at_s = 0.0
         self._leaving = self._rereading = self._opening = self._breaking = False
+        self._half_was_there = False  # of the hardware that `auto` looks for
         self._scope = Scope(1000.0)
         self._wear: WearWatch | None = None
         self._homed = False

@@ -45,7 +45,11 @@ class StageWorld(StageState):
             if absent:
                 self._wait_for(absent)
                 return
-        except (ProfileError, LinkError) as error:
+        except LinkError as error:
+            self._half_was_there = True
+            self._wait_for(str(error))
+            return
+        except ProfileError as error:
             self._wait_for(str(error))
             return
         except RequestError as error:
@@ -105,7 +109,8 @@ class StageWorld(StageState):
         """Return the world, what was asked for, and by whom: a client before the restart, else the service's start.
 
         A swap counts for the profile it was made with and for as long as the service is started in the same way. Where
-        `auto` once found hardware, hardware that is late at the next start is waited for.
+        `auto` once found hardware, hardware that is late at the next start is waited for; and the other half where it
+        has found one, also while that is gone for a moment: a USB adapter that is counted anew makes no rig of a machine.
         """
         asked, kept = self._backend_asked, self._memory.now
         if kept.profile == str(profile.source_path):
@@ -113,6 +118,8 @@ class StageWorld(StageState):
                 return kept.backend, kept.backend_asked or kept.backend, "a client before the restart"
             if asked == "auto" and kept.backend == "hardware" and not kept.swapped_from:
                 return kept.backend, asked, "auto found it at an earlier start"
+        if asked == "auto" and self._half_was_there:
+            return "hardware", asked, "auto found a part of it before"
         self._memory.keep(swapped_from="")
         return choose(profile, asked), asked, "the service's start"
 

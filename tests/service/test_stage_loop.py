@@ -1,5 +1,7 @@
 """The stage's thread on the rig in virtual time: faults, what leads out of them, refusals, worlds that are missing."""
 
+import os
+import threading
 import time
 
 import pytest
@@ -16,7 +18,7 @@ from stagectl.service.desk import Busy, Desk, Ending, Order, Unfit
 from stagectl.service.exposition import Figures
 from stagectl.service.lease import LeaseRefused
 from stagectl.service.notify import Notifier
-from stagectl.service.remembered import Remembered, recall
+from stagectl.service.remembered import Memory, Remembered, recall
 from stagectl.service.service_log import ServiceLog
 from stagectl.service.stage_loop import StageLoop
 from stagectl.service.stage_state import Settings
@@ -27,6 +29,15 @@ from tests.toml_text import changed
 pytestmark = pytest.mark.real_time
 
 PATIENCE_S = 60.0
+
+
+def joint(backend):
+    """What a joint was identified as in a world."""
+    return messages.Backlash(
+        width_m=2e-4, centre_m=0.0, left_m=1e-4, right_m=1e-4, left_stiffness_n_per_m=1e4,
+        right_stiffness_n_per_m=1e4, width_sd_m=1e-7, at="2026-01-01T00:00:00.000+00:00", run="r",
+        profile_name="oled-printer", backend=backend,
+    )  # fmt: skip
 
 
 class Bench:
@@ -511,11 +522,7 @@ def test_a_position_that_is_old_is_not_known(bench, kind):
 
 
 def test_the_joint_of_one_world_is_not_shown_in_another_and_keeps_the_date_it_was_seen_at(tmp_path):
-    rigs = messages.Backlash(
-        width_m=2e-4, centre_m=0.0, left_m=1e-4, right_m=1e-4, left_stiffness_n_per_m=1e4,
-        right_stiffness_n_per_m=1e4, width_sd_m=1e-7, at="2026-01-01T00:00:00.000+00:00", run="r",
-        profile_name="oled-printer", backend="rig",
-    )  # fmt: skip
+    rigs = joint("rig")
     bench = Bench(tmp_path, profile="oled-printer", remembered=Remembered(joints={"rig oled-printer": rigs}))
     bench.loop.step()
     bench.until(lambda: bench.status.state == "idle")
@@ -556,6 +563,65 @@ def test_where_auto_once_found_hardware_late_hardware_is_waited_for(tmp_path):
     bench = Bench(tmp_path, backend="auto", remembered=Remembered(profile=path, backend="hardware"))
     bench.loop.step()
     assert (bench.status.state, bench.status.backend) == ("off", "hardware")
+
+
+def test_auto_that_saw_half_of_the_hardware_takes_no_rig_when_that_is_gone_for_a_moment(tmp_path):
+    """A USB adapter is counted anew while somebody plugs the other one in."""
+    path, can, port = tmp_path / "mine.toml", tmp_path / "can", tmp_path / "port"
+    there = {"can.interface": "hub", "can.channel": str(can), "interferometer.port": str(port)}
+    path.write_text(changed(PROFILES_FOLDER / "single-axis.toml", there))
+    port.touch()
+    bench = Bench(tmp_path, profile=str(path), backend="auto")
+    bench.loop.step()
+    assert (bench.status.state, bench.status.backend) == ("off", "")
+    port.unlink()
+    bench.loop._retry_at_s = 0.0
+    bench.loop.step()
+    assert (bench.status.state, bench.status.backend) == ("off", "hardware")
+
+
+def test_what_a_request_can_not_have_costs_no_world(tmp_path):
+    """A swap to `auto` with half of the hardware, and a profile with a slip, are refused: no fault, still homed."""
+    path, port = tmp_path / "mine.toml", tmp_path / "port"
+    there = {"can.interface": "hub", "can.channel": str(tmp_path / "can"), "interferometer.port": str(port)}
+    path.write_text(changed(PROFILES_FOLDER / "single-axis.toml", there))
+    port.touch()
+    bench = Bench(tmp_path, profile=str(path))
+    bench.loop.show()
+    bench.until(lambda: bench.status.state == "idle")
+    bench.take()
+    stage, bench.loop._homed = bench.loop._stage, True
+    swapped = bench.do("backend", messages.SwapBackend(backend="auto"))
+    path.write_text("name = 3\n")
+    reread = bench.do("reread", messages.Home())
+    assert "plug it in" in swapped.error.message
+    assert "kept as it was" in reread.error.message
+    assert {swapped.error.kind, reread.error.kind} == {"RequestError"}
+    assert (bench.status.state, bench.status.fault, bench.status.homed) == ("idle", None, True)
+    assert bench.loop._stage is stage
+    bench.loop.leave()
+    bench.loop.run()
+
+
+def test_what_the_joint_is_found_to_be_waits_for_no_disk(tmp_path, monkeypatch):
+    """An identification ends with power on: half a second without a word of the supervisor stops the stage."""
+    goes_on, said = threading.Event(), []
+    fsync = os.fsync
+
+    def slowly(descriptor):
+        assert goes_on.wait(20.0), "the stage's thread waits for the disk"
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slowly)
+    memory = Memory(tmp_path, Remembered(), said.append)
+    found = joint("batch")
+    memory.keep_joint(found)
+    assert memory.joint("batch", "oled-printer") == found
+    assert recall(tmp_path)[0].joints == {}
+    goes_on.set()
+    memory.keep(powered_since="")
+    assert recall(tmp_path)[0].joints == {"batch oled-printer": found}
+    assert said == []
 
 
 def test_a_profile_edited_to_nonsense_changes_nothing(tmp_path):
