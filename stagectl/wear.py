@@ -37,6 +37,8 @@ class WearLimits:
     trusted_sd_m: float
     drift_m_per_sqrt_s: float
     """Random walk of each edge: by it a value that nothing confirms gets less sure."""
+    stiffness_drift_ratio_per_sqrt_s: float = 0.0
+    """The same of each stiffness, as a share of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +139,17 @@ class WearTracker:
         age_s = max(t_s - self.newest.t_s, 0.0)
         walk_m = self._limits.drift_m_per_sqrt_s * math.sqrt(2.0 * age_s)
         return math.hypot(width_sd_m(self.newest.estimate), walk_m)
+
+    def stiffness_sds_n_per_m(self, t_s: float) -> tuple[float, float]:
+        """Return how sure the newest stiffness is now, left and right; grows like `sd_m`."""
+        if self.newest is None:
+            return math.inf, math.inf
+        one, age_s = self.newest.estimate, max(t_s - self.newest.t_s, 0.0)
+        walk = self._limits.stiffness_drift_ratio_per_sqrt_s * math.sqrt(age_s)
+        return (
+            math.hypot(one.left_stiffness_sd_n_per_m, walk * one.left_stiffness_n_per_m),
+            math.hypot(one.right_stiffness_sd_n_per_m, walk * one.right_stiffness_n_per_m),
+        )
 
     @property
     def alarm(self) -> str:

@@ -76,6 +76,15 @@ def test_a_value_that_nothing_confirms_gets_less_sure():
     fresh = width_sd_m(GOOD)
     assert tracker.sd_m(100.0) == pytest.approx(fresh)
     assert tracker.sd_m(100.0 + 86400.0) == pytest.approx(math.hypot(fresh, 1e-9 * math.sqrt(2.0 * 86400.0)))
+    walk = replace(LIMITS, stiffness_drift_ratio_per_sqrt_s=1e-5)
+    stiff = WearTracker(walk, Look(100.0, GOOD, IDENTIFIED)).stiffness_sds_n_per_m(100.0 + 86400.0)
+    walked = 1e-5 * math.sqrt(86400.0)
+    assert stiff == pytest.approx(
+        (
+            math.hypot(GOOD.left_stiffness_sd_n_per_m, walked * GOOD.left_stiffness_n_per_m),
+            math.hypot(GOOD.right_stiffness_sd_n_per_m, walked * GOOD.right_stiffness_n_per_m),
+        )
+    )
     sds = [tracker.sd_m(100.0 + 10.0**k) for k in range(8)]
     assert sds == sorted(sds)
     assert WearTracker(LIMITS).sd_m(0.0) == math.inf

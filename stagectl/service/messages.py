@@ -174,7 +174,7 @@ class Failure(BaseModel):
 
 
 class Backlash(BaseModel):
-    """The joint as it was identified."""
+    """The joint as it was known last."""
 
     width_m: float
     centre_m: float
@@ -183,6 +183,10 @@ class Backlash(BaseModel):
     left_stiffness_n_per_m: float
     right_stiffness_n_per_m: float
     width_sd_m: float | None
+    left_stiffness_sd_n_per_m: float | None = None
+    right_stiffness_sd_n_per_m: float | None = None
+    source: str = ""
+    """What it was learned from: identified, touch probe, production; empty where an older service kept it."""
     at: str
     """When, UTC."""
     run: str

@@ -153,9 +153,9 @@ class StageLoop(StageWatch):
         if not motion.needs_homing:
             self._homed = outcome.finished
         self._settle(order.name)
-        backlash = self._kept_backlash(outcome, folder.name) if motion.identifies else None
+        source = PROBE if order.name == "probe" else IDENTIFIED
+        backlash = self._kept_backlash(outcome, folder.name, source) if motion.identifies else None
         if backlash is not None and self._wear is not None:
-            source = PROBE if order.name == "probe" else IDENTIFIED
             self._wear.found(outcome.backlash, source, is_believed=order.name == "home")
         self._finish(order, outcome.text, outcome.stop.name, str(folder), backlash)
         self._log.say("command_done", outcome.text, name=order.name, key=order.key, stop=outcome.stop.name)
@@ -179,11 +179,11 @@ class StageLoop(StageWatch):
         elif wear.probe_due():
             self.desk.submit_own("probe", messages.Probe())
 
-    def _kept_backlash(self, outcome: Outcome, run: str) -> messages.Backlash | None:
+    def _kept_backlash(self, outcome: Outcome, run: str, source: str) -> messages.Backlash | None:
         estimate, stage = outcome.backlash, self._stage
         if estimate is None or not outcome.finished or not estimate.identifiable or stage is None:
             return None
-        found = backlash_message(estimate, run, stage.profile.name, self._backend, now_text())
+        found = backlash_message(estimate, run, stage.profile.name, self._backend, now_text(), source)
         self._memory.keep_joint(found)
         return found
 

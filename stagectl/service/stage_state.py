@@ -24,6 +24,7 @@ from stagectl.service.view import BANNERS, backlash_message, health, limits, pos
 from stagectl.service.wear_watch import WearWatch
 from stagectl.signals import STOP_TEXT, Stop
 from stagectl.supervisor import Supervisor
+from stagectl.wear import PRODUCTION
 
 _LATENESS_EVERY_S = 0.5
 _VERSION = metadata.version("stagectl")
@@ -129,7 +130,8 @@ class StageState:
         name, run = stage.profile.name, self._recording.folder(stage.folder).name
         before = self._memory.joint(self._backend, name)
         if before is None or before.at != wear.seen_at:  # not what an earlier motion showed, as if it were news
-            self._memory.keep_joint(backlash_message(found, run, name, self._backend, wear.seen_at))
+            kept = backlash_message(found, run, name, self._backend, wear.seen_at, PRODUCTION)
+            self._memory.keep_joint(kept)
 
     def _heed_record_requests(self) -> None:
         """Begin or end a run that a client asked for; motions go on meanwhile."""

@@ -109,8 +109,8 @@ class StageWorld(StageState):
         """Return the world, what was asked for, and by whom: a client before the restart, else the service's start.
 
         A swap counts for the profile it was made with and for as long as the service is started in the same way. Where
-        `auto` once found hardware, hardware that is late at the next start is waited for; and the other half where it
-        has found one, also while that is gone for a moment: a USB adapter that is counted anew makes no rig of a machine.
+        `auto` once found hardware, hardware that is late at the next start is waited for; so is all of it where a half was
+        there and is gone: a USB adapter that is counted anew makes no rig of a machine. LinkError where there is a half.
         """
         asked, kept = self._backend_asked, self._memory.now
         if kept.profile == str(profile.source_path):
@@ -118,10 +118,14 @@ class StageWorld(StageState):
                 return kept.backend, kept.backend_asked or kept.backend, "a client before the restart"
             if asked == "auto" and kept.backend == "hardware" and not kept.swapped_from:
                 return kept.backend, asked, "auto found it at an earlier start"
-        if asked == "auto" and self._half_was_there:
-            return "hardware", asked, "auto found a part of it before"
+        chosen = choose(profile, asked)
+        if chosen != asked and chosen == "rig" and self._half_was_there:
+            raise LinkError(
+                f"profile {profile.name}: a part of the hardware was there and is gone; plug all of it in, or ask for "
+                "--backend rig by name"
+            )
         self._memory.keep(swapped_from="")
-        return choose(profile, asked), asked, "the service's start"
+        return chosen, asked, "the service's start"
 
     def _wait_for(self, what: str) -> None:
         if what != self._waiting_for:

@@ -24,7 +24,7 @@ BANNERS = {
 
 
 def backlash_message(
-    estimate: BacklashEstimate, run: str, profile_name: str, backend: str, at: str
+    estimate: BacklashEstimate, run: str, profile_name: str, backend: str, at: str, source: str
 ) -> messages.Backlash:
     """Lay an estimate out with its date and the world that it is of."""
     return messages.Backlash(
@@ -35,6 +35,9 @@ def backlash_message(
         left_stiffness_n_per_m=estimate.left_stiffness_n_per_m,
         right_stiffness_n_per_m=estimate.right_stiffness_n_per_m,
         width_sd_m=finite(math.hypot(estimate.left_sd_m, estimate.right_sd_m)),
+        left_stiffness_sd_n_per_m=finite(estimate.left_stiffness_sd_n_per_m),
+        right_stiffness_sd_n_per_m=finite(estimate.right_stiffness_sd_n_per_m),
+        source=source,
         at=at,
         run=run,
         profile_name=profile_name,

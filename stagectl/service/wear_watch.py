@@ -21,6 +21,7 @@ _LOOK_EVERY_S = 1.0
 _TOUCH_SHARE = 0.1  # of the touch force: less is no contact for sure
 _LEAST_FORCE_N = 0.3
 _LEAST_DRIFT_M_PER_SQRT_S = 1e-9  # 0.3 um in a day, where the profile says nothing
+_STIFFNESS_DRIFT_RATIO_PER_SQRT_S = 1e-5  # 0.3 % in a day
 _NEWS_RATIO = 0.02  # of a stiffness
 
 
@@ -47,22 +48,23 @@ class WearWatch:
                 stiffness_change_limit_ratio=wear.stiffness_change_limit_ratio,
                 trusted_sd_m=wear.trusted_sd_m,
                 drift_m_per_sqrt_s=max(wear.edge_drift_m_per_sqrt_s, _LEAST_DRIFT_M_PER_SQRT_S),
+                stiffness_drift_ratio_per_sqrt_s=_STIFFNESS_DRIFT_RATIO_PER_SQRT_S,
             )
         )
 
     def recall(self, last: messages.Backlash | None) -> None:
-        """Go on from what this world's joint was identified as earlier."""
+        """Go on from what was known of this world's joint earlier."""
         if self._tracker is None or last is None:
             return
         sd_m = math.inf if last.width_sd_m is None else last.width_sd_m / math.sqrt(2.0)
         values = {name: getattr(last, name) for name in ("left_m", "right_m")}
-        values |= {
-            f"{side}_stiffness_n_per_m": getattr(last, f"{side}_stiffness_n_per_m") for side in ("left", "right")
-        }
-        unknown = dict.fromkeys(("left_stiffness_sd_n_per_m", "right_stiffness_sd_n_per_m"), math.inf)
-        estimate = BacklashEstimate(**values, **unknown, left_sd_m=sd_m, right_sd_m=sd_m)
+        for name in (f"{side}_stiffness" for side in ("left", "right")):
+            stiffness_sd = getattr(last, f"{name}_sd_n_per_m")
+            values[f"{name}_n_per_m"] = getattr(last, f"{name}_n_per_m")
+            values[f"{name}_sd_n_per_m"] = math.inf if stiffness_sd is None else stiffness_sd
+        estimate = BacklashEstimate(**values, left_sd_m=sd_m, right_sd_m=sd_m)
         age_s = (datetime.now(UTC) - datetime.fromisoformat(last.at)).total_seconds()
-        self._tracker.go_on_from(Look(self._now_s() - max(age_s, 0.0), estimate, IDENTIFIED))
+        self._tracker.go_on_from(Look(self._now_s() - max(age_s, 0.0), estimate, last.source or IDENTIFIED))
         self.seen_at = last.at
 
     def observe(self, rows: np.ndarray) -> None:
@@ -143,6 +145,7 @@ class WearWatch:
         if tracker is None or tracker.newest is None:
             return None
         now_s, newest = self._now_s(), tracker.newest
+        left_sd, right_sd = tracker.stiffness_sds_n_per_m(now_s)
         one, age_s, observable = newest.estimate, max(now_s - newest.t_s, 0.0), tracker.observable(now_s)
         age = (
             "" if observable else f"not observable: both edges were not touched lately; the value is {_span(age_s)} old"
@@ -152,8 +155,8 @@ class WearWatch:
             right_m=one.right_m,
             left_stiffness_n_per_m=one.left_stiffness_n_per_m,
             right_stiffness_n_per_m=one.right_stiffness_n_per_m,
-            left_stiffness_sd_n_per_m=finite(one.left_stiffness_sd_n_per_m),
-            right_stiffness_sd_n_per_m=finite(one.right_stiffness_sd_n_per_m),
+            left_stiffness_sd_n_per_m=finite(left_sd),
+            right_stiffness_sd_n_per_m=finite(right_sd),
             width_m=one.width_m,
             width_sd_m=finite(tracker.sd_m(now_s)),
             at=self.seen_at,

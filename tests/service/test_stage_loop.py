@@ -577,7 +577,8 @@ def test_auto_that_saw_half_of_the_hardware_takes_no_rig_when_that_is_gone_for_a
     port.unlink()
     bench.loop._retry_at_s = 0.0
     bench.loop.step()
-    assert (bench.status.state, bench.status.backend) == ("off", "hardware")
+    assert (bench.status.state, bench.status.backend) == ("off", "")
+    assert "a part of the hardware was there and is gone; plug all of it in" in bench.status.waiting_for
 
 
 def test_what_a_request_can_not_have_costs_no_world(tmp_path):

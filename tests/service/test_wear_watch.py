@@ -16,9 +16,10 @@ from stagectl.requests import Phase
 from stagectl.row import new_rows
 from stagectl.service import messages
 from stagectl.service.service_log import ServiceLog
+from stagectl.service.view import backlash_message
 from stagectl.service.wear_watch import WearWatch
 from stagectl.signals import SETPOINT
-from stagectl.wear import IDENTIFIED, LOOKS_COUNT
+from stagectl.wear import IDENTIFIED, LOOKS_COUNT, PRODUCTION
 from tests.struck_stage import Stage
 
 JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
@@ -55,6 +56,16 @@ class Watched:
         return self.watch.message()
 
 
+def test_what_production_showed_is_still_that_after_a_restart(oled_profile):
+    one, after = Watched(oled_profile), Watched(oled_profile)
+    seen = one.work(joint(oled_profile), 3.0, -3.0)
+    found = one.watch.newest_of_production()
+    after.watch.recall(backlash_message(found, "r", "oled-printer", "rig", one.watch.seen_at, PRODUCTION))
+    again = after.watch.message()
+    assert (again.source, again.observable) == (PRODUCTION, False)
+    assert again.left_stiffness_sd_n_per_m == pytest.approx(seen.left_stiffness_sd_n_per_m, rel=1e-3)
+
+
 def test_contact_on_both_sides_makes_it_observable_and_its_absence_is_said(oled_profile):
     one = Watched(oled_profile)
     found = joint(oled_profile)
@@ -72,6 +83,7 @@ def test_contact_on_both_sides_makes_it_observable_and_its_absence_is_said(oled_
         assert seen.text.startswith("not observable: both edges were not touched lately; the value is ")
         assert seen.width_m == pytest.approx(found.width_m)
         assert seen.width_sd_m > before.width_sd_m
+        assert seen.left_stiffness_sd_n_per_m > before.left_stiffness_sd_n_per_m
     assert seen.age_s == pytest.approx(3.0 * 3601.0)
 
 
