@@ -25,6 +25,7 @@ _HEARTBEAT_S = 0.265  # trip.heartbeat_s, a heartbeat's own period, and two look
 _MASTER_HEARTBEAT_S = 0.205
 _SUPERVISOR_S = 0.5 + 2 * CYCLE_S
 _LEASE_S = 2.0  # what a lease lasts that nobody renews
+JOG_HOLD_S = 0.3  # for how long a word of a jog's operator holds
 FRAME_S = 130e-6  # eight bytes at 1 Mbit/s
 NEVER_S = float("inf")
 
