@@ -139,6 +139,8 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     noticed = noticed if noticed is not None and noticed < facts.judged_until_t_ns else None
     stopped = bool(facts.fault_kind) or noticed is not None
     found: list[tuple[str, str]] = []
+    if not facts.struck:
+        found.append((COURSE, "the fault never struck: what there is says nothing of it"))
     if drawn.must_stop and not facts.fault_kind and facts.phase not in AT_WILL:
         found.append((COURSE, "it went on"))
     if not drawn.may_stop and facts.fault_kind:
@@ -152,6 +154,10 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         found += _unstopped(facts, record, of)
     elif noticed is not None and not np.isfinite(drawn.detection_s):
         found += [(TRAVEL, text) for text in astray(facts, record.columns, noticed, of)]
+    if drawn.silent and facts.phase == "jogging":
+        way_m, silent_m = silent_way_m(facts, facts.fault_t_ns, end, of)
+        if not way_m <= silent_m:
+            found.append((TRAVEL, f"nobody held its key: macro went {way_m * 1e3:.3f} mm, bound {silent_m * 1e3:.3f}"))
     for from_t_ns, until_t_ns in facts.unasked:
         found += [(STANDSTILL, text) for text in moved_at_rest(seen, from_t_ns, until_t_ns)]
     if facts.fault_kind and not _had_power(seen, facts.fault_t_ns, noticed, end):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.service_batch import RUNS
 from tests.faults import campaign
 from tests.faults.judge import (
     BACK,
@@ -19,7 +20,7 @@ from tests.faults.judge import (
     Record,
     judge,
 )
-from tests.faults.kinds import KINDS, MACRO, MICRO, SILENCE_S, Drawn
+from tests.faults.kinds import KINDS, MACRO, MICRO, PHASES, SILENCE_S, Drawn
 from tests.faults.limp import shorted_way_m
 from tests.faults.mechanics import mechanics_of
 from tests.faults.scene import Facts
@@ -84,7 +85,7 @@ def rest_after(ramp_m_per_s2: float, noticed_s: float = 0.02) -> tuple[Facts, Re
 
 
 def unstopped(phase: str) -> tuple[Facts, Record]:
-    """Make the log of a motion that no fault stopped: at 0.4 m/s, to rest by the plan's 0.9 m/s^2, or a stage that holds.
+    """Make the log of what no fault stopped: 0.4 m/s, to rest by the plan's 0.9 m/s^2, or a stage that holds.
 
     Its end is reached at 1.5 s; 1 kHz, 2 s.
     """
@@ -389,3 +390,38 @@ def test_an_acknowledgement_that_gives_power_or_moves_the_stage_is_seen(axis):
     facts.unasked = [(1_900_000_000, 1_990_000_000)]
     facts.seen["macro_position_m"][1950:] += 30e-6
     assert bars_missed(facts, record) == {STANDSTILL}
+
+
+def test_a_jog_whose_operator_has_vanished_is_judged_by_its_own_hold_and_not_by_the_lease():
+    facts, record = unstopped("jogging")
+    t_s = facts.seen["t_ns"] * 1e-9
+    gone = Drawn("client vanishes", detection_s=0.8, silent=True)
+    for ends_s, missed in ((1.4, set()), (1.6, {TRAVEL})):
+        speed = (0.2 - 0.9 * (t_s - ends_s).clip(min=0.0)).clip(min=0.0)
+        facts.seen["macro_velocity_m_per_s"], facts.seen["macro_position_m"] = speed, np.cumsum(speed) * 1e-3
+        facts.seen["states"][1800:] = _STOPPED
+        record.columns["run_phase"][1800:], record.columns["stop"][1800:] = 6, 18
+        left = replace(facts, fault_kind="LEASE", planned_m_per_s=0.2)
+        assert bars_missed(left, record, gone) == missed
+
+
+def test_a_fault_that_never_struck_shows_nothing():
+    facts, record = unstopped("at rest")
+    facts.struck = False
+    assert bars_missed(facts, record, GOES_BY) == {COURSE}
+
+
+def test_the_seeded_part_has_those_that_must_stop_of_kinds_that_may_go_by():
+    drawn = [campaign.drawn(seed) for seed in range(RUNS)]
+    either = ("encoder glitch", "interferometer silent", "host overrun", "supervisor hangs")
+    assert {kind for kind, _, fault, _ in drawn if kind in either and fault.must_stop} == set(either)
+    assert {phase for kind, phase, *_ in drawn if kind == "obstacle (following error)"} >= {"constant speed"}
+    assert "jogging" in {phase for kind, phase, *_ in drawn if kind == "client vanishes"}
+    many = [campaign.drawn(seed) for seed in range(900)]
+    for one in either:
+        musts = [fault.must_stop for kind, _, fault, _ in many if kind == one]
+        assert 0.25 < sum(musts) / len(musts) < 0.75
+    phases = [phase for kind, phase, *_ in many if kind == "obstacle (following error)"]
+    assert set(phases) == set(PHASES)
+    vanished = [phase for kind, phase, *_ in many if kind == "client vanishes"]
+    assert sum(phase == "jogging" for phase in vanished) >= 0.5 * len(vanished)
