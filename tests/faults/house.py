@@ -22,6 +22,7 @@ from tests.service.daemon import PATIENT, Daemon
 CHANGES = {**PATIENT, "macro.homing.speed_m_per_s": 0.1, "macro.homing.acceleration_m_per_s2": 0.5}
 LOOK_S = 0.02
 JOG_M_PER_S = 0.12
+JOG_HOLD_S = 0.5
 IDENTIFY_S = 4.0
 _PATIENCE_S = 120.0
 _UNDER_WAY_S = 10.0
@@ -122,8 +123,8 @@ class House:
                 try:
                     client.renew_lease()
                     if self._jogging.is_set():
-                        jog = jog or client.begin_jog(0.5).key
-                        client.jog_at(jog, self._speed_m_per_s, 0.5)
+                        jog = jog or client.begin_jog(JOG_HOLD_S).key
+                        client.jog_at(jog, self._speed_m_per_s, JOG_HOLD_S)
                 except JogOver:
                     jog = ""
                 except LinkError:
@@ -198,6 +199,7 @@ class House:
                 reader = pa.ipc.open_stream(file)
                 for batch in reader:
                     t_ns = batch.column("t_ns").to_numpy()
-                    late = batch.column("lateness_ns").to_numpy()[(t_ns >= since_t_ns) & (t_ns <= until_t_ns)]
-                    worst = max(worst, int(late.max(initial=0)))
+                    late = batch.column("lateness_ns").to_numpy()
+                    due = (t_ns >= since_t_ns) & (t_ns - late <= until_t_ns)  # a cycle that was due by then
+                    worst = max(worst, int(late[due].max(initial=0)))
         return 1e-9 * worst

@@ -21,7 +21,11 @@ back, against a drive that holds; when it is gone the drive comes back to where 
 that way, which is the overshoot of its position loop, and by what its integral was wound up to meanwhile. That is at
 most the rest of its greatest force, F / m - w^2 e at e from its goal, and throws it F / (m w^2) - e beyond. All that is
 a spring, no command: only forward travel is judged until the obstacle is gone and the loop stands, by the same bound;
-from there on the macro must stand as after any fault.
+from there on the macro must stand as after any fault. A drive whose encoder jumps goes with it, there and back, with
+that overshoot: it holds on nothing else. By how much more such an encoder misleads its ramp is no excuse.
+
+A motion that no fault stops, or none has stopped yet, is judged in `unstopped.py`; a stop that the operator asked for
+by the same bound with the law's ramp. Behind the acknowledgement nothing may move or get power until it is asked for.
 """
 
 import contextlib
@@ -171,7 +175,8 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         dark = MACRO in drawn.without_power
         rest = _rest(seen, at, end, noticed)
         stands, rests = _stands(seen, rest, end), end if rest is None else rest
-        back_m = 0.0
+        shifted_m = (1.0 + OVERSHOOT) * drawn.encoder_m
+        back_m = shifted_m
         if drawn.pushed:
             free = min(int(np.searchsorted(t_ns, facts.fault_t_ns + round(1e9 * drawn.lasts_s))), end)
             stands = min(max(stands, free + RELEASED_SAMPLES), end)
@@ -199,9 +204,9 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         held_m, drift_m = _moved_after(seen, stands, end)
         if rest is not None and not drawn.pushed:
             settled_m = float(np.abs(position[rest:stands] - position[rest]).max(initial=0.0))
-            if settled_m > SETTLING_M:
+            if settled_m > SETTLING_M + shifted_m:
                 found.append((STANDSTILL, f"macro moved {settled_m * 1e6:.0f} um while it settled"))
-        if held_m > STANDSTILL_M:
+        if held_m > STANDSTILL_M + shifted_m:
             found.append((STANDSTILL, f"macro moved {held_m * 1e6:.0f} um after standstill, with power"))
         if noticed is not None and not dark:
             heard = noticed if MACRO not in drawn.deaf else max(noticed, facts.fault_t_ns + round(1e9 * SILENCE_S))

@@ -52,6 +52,7 @@ class Drawn:
     deaf: tuple[int, ...] = ()  # nodes that hear no command: their own watch stops them
     open_loop: bool = False  # the drive keeps its last force until the fault is noticed
     silent: bool = False  # the operator says nothing more: a jog ends by its own hold, before the lease does
+    encoder_m: float = 0.0  # by which the drive's own encoder is off for a while: it holds on that
     pushed: bool = False  # by something that is no command: how far is not judged
 
 
@@ -227,8 +228,11 @@ def master_heartbeat_lost(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def encoder_glitch(rng: np.random.Generator, phase: str) -> Drawn:
-    """Counts appear from nowhere; what is less than 50 um and a period's way is not told apart from jitter."""
-    must, sign = grave(rng), one_of(rng, (-1.0, 1.0))
+    """Counts appear from nowhere; what is less than 50 um and a period's way is not told apart from jitter.
+
+    In a homing the lasers have no zero yet that the encoder could be held against.
+    """
+    must, sign = grave(rng) and phase != "homing", one_of(rng, (-1.0, 1.0))
     offset_m = sign * (between(rng, 1.2e-3, 5e-3) if must else between(rng, 5e-6, 1.2e-3))
     duration_s = between(rng, 0.03, 0.5) if must else between(rng, 1e-3, 0.5)
     return Drawn(
@@ -237,6 +241,7 @@ def encoder_glitch(rng: np.random.Generator, phase: str) -> Drawn:
         must_stop=must,
         detection_s=0.02 if must else NEVER_S,
         lasts_s=duration_s,
+        encoder_m=abs(offset_m),
     )
 
 

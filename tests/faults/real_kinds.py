@@ -111,7 +111,7 @@ def killed_both(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
 
 def client_vanishes(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
     """A client's program ends while it holds the key."""
-    return Real(Drawn("client vanishes", act=lambda house: house.vanish(), detection_s=LEASE_S))
+    return Real(Drawn("client vanishes", act=lambda house: house.vanish(), detection_s=LEASE_S, silent=True))
 
 
 def _of_rig(text: str, faults: dict, **known) -> Real:

@@ -31,7 +31,7 @@ from tests.toml_text import changed
 PROFILE = "oled-printer"
 _HOMING = {"macro.homing.speed_m_per_s": 0.1, "macro.homing.acceleration_m_per_s2": 0.5}
 _RENEW_NS, _PRESS_NS = 300_000_000, 100_000_000
-_TOP_M_PER_S = 0.449  # moves are planned to 0.9 of the profile's 0.5
+TOP_M_PER_S = 0.449  # moves are planned to 0.9 of the profile's 0.5
 _PATIENCE_S = 15.0  # of the rig's time: to a standstill, and from a fault to the next state
 _TRIES = 4
 _DISK_BYTES = 24 << 20
@@ -383,14 +383,14 @@ class Scene:
             self.facts.planned_m_per_s = abs(self._jog_m_per_s)
             self._press()
         elif phase == "identifying":
-            self.facts.planned_m_per_s = _TOP_M_PER_S
+            self.facts.planned_m_per_s = TOP_M_PER_S
             self.begin("identify", messages.Identify(duration_s=4.0))
         elif phase == "homing":
             self.facts.planned_m_per_s = _HOMING["macro.homing.speed_m_per_s"]
             self.begin("home", messages.Home())
         elif phase != "at rest":
             self._due = lambda: self._in_phase(share)
-            self.facts.target_m, self.facts.planned_m_per_s = sign * float(rng.uniform(0.33, 0.42)), _TOP_M_PER_S
+            self.facts.target_m, self.facts.planned_m_per_s = sign * float(rng.uniform(0.33, 0.42)), TOP_M_PER_S
             self.begin("move", messages.Move(target_m=self.facts.target_m))
 
     def _in_phase(self, share: float) -> bool:
@@ -398,12 +398,12 @@ class Scene:
         speed = abs(self.rig.plant_state()["macro_velocity_m_per_s"])
         self._fastest_m_per_s = max(self._fastest_m_per_s, speed)
         if self.phase == "accelerating":
-            return speed >= share * _TOP_M_PER_S
+            return speed >= share * TOP_M_PER_S
         if self.phase == "decelerating":
-            return self._fastest_m_per_s > 0.98 * _TOP_M_PER_S and speed <= share * _TOP_M_PER_S
-        if speed < 0.998 * _TOP_M_PER_S and self.phase == "constant speed":
+            return self._fastest_m_per_s > 0.98 * TOP_M_PER_S and speed <= share * TOP_M_PER_S
+        if speed < 0.998 * TOP_M_PER_S and self.phase == "constant speed":
             return False
-        if self.phase == "stopping" and self._fastest_m_per_s > share * _TOP_M_PER_S:
+        if self.phase == "stopping" and self._fastest_m_per_s > share * TOP_M_PER_S:
             if not self.desk.stop_asked and self.loop._state == "moving":
                 self.facts.stop_asked_t_ns = self.t_ns
                 self.desk.ask_to_stop("the operator")

@@ -425,3 +425,12 @@ def test_the_seeded_part_has_those_that_must_stop_of_kinds_that_may_go_by():
     assert set(phases) == set(PHASES)
     vanished = [phase for kind, phase, *_ in many if kind == "client vanishes"]
     assert sum(phase == "jogging" for phase in vanished) >= 0.5 * len(vanished)
+
+
+def test_a_drive_goes_with_its_own_encoder_and_no_further():
+    lies = replace(FAULT, encoder_m=1e-3)
+    for off_m, missed in ((1.1e-3, set()), (1.5e-3, {STANDSTILL})):
+        facts, record = rest_after(2.0)
+        facts.seen["macro_position_m"][1600:] += off_m
+        assert bars_missed(facts, record) == {STANDSTILL}
+        assert bars_missed(facts, record, lies) == missed
