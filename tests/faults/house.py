@@ -41,6 +41,7 @@ class House:
         self.accepted: list[str] = []
         self._jogging = threading.Event()
         self._over = threading.Event()
+        self._mute = threading.Event()
         self._speed_m_per_s = 0.0
         self._channel = ""
 
@@ -112,6 +113,7 @@ class House:
     def _keep_lease(self) -> None:
         self._over.set()
         self._over = threading.Event()
+        self._mute.clear()
         threading.Thread(target=self._operate, args=(self._over,), daemon=True).start()
 
     def _operate(self, over: threading.Event) -> None:
@@ -120,6 +122,8 @@ class House:
         with Client(self.daemon.socket) as client:
             client.lease_token = self.daemon.client.lease_token
             while not over.wait(0.1):
+                if self._mute.is_set():
+                    continue
                 try:
                     client.renew_lease()
                     if self._jogging.is_set():
@@ -184,9 +188,9 @@ class House:
         """Hold no key any more."""
         self._jogging.clear()
 
-    def vanish(self) -> None:
-        """The operator's program is gone."""
-        self._over.set()
+    def vanish(self, half_open: bool = False) -> None:
+        """The operator's program is gone; `half_open`: as one that hangs, or behind a cut cable, its socket stays."""
+        (self._mute if half_open else self._over).set()
         self.daemon.client.lease_token = ""
 
     # ---- judging -------------------------------------------------------------------------------------------------
