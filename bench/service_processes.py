@@ -11,7 +11,7 @@ from tests.faults import losses, real, soak
 from tests.faults.judge import BACK, BARS, BEGUN, GENTLE, LOST, TRAVEL
 from tests.faults.kinds import CYCLE_S
 
-SEEDS = (1, 4, 11, 26, 33, 35, 36, 38, 41, 62)  # what only processes can show, two faults of the wire, all motions
+SEEDS = (1, 11, 26, 33, 35, 36, 38, 41, 62, 99)  # what only processes can show, two faults of the wire, all motions
 FULL_RUNS = 100
 _SOAK_S, _FULL_SOAK_S, _WARM_UP_S = 150.0, 1200.0, 30.0
 _CUTS_S = (0.0, 1.5)  # of jogging

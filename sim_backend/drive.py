@@ -113,6 +113,11 @@ class Drive:
         self._follows = False  # position mode: a target came since the mode was entered
         self.power_up()
 
+    def shift_encoder(self, offset_m: float) -> None:
+        """Let counts appear from nowhere, in its loops and in what it says of its position."""
+        self.servo_parameters["encoder_offset_m"] += offset_m
+        self._offset_m += offset_m
+
     def power_up(self) -> None:
         """Bring objects and states to what a reset leaves; the encoder keeps counting."""
         self._controlword = 0

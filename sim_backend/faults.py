@@ -78,6 +78,7 @@ class Fault:
     value: int | None = None
     offset_m: float | None = None  # of encoder or right edge; of an obstacle, from where the macro is
     ppm: float | None = None
+    seed: int | None = None  # of the bytes of garbage; None = letters, none of which belongs to a line
     axis: str | None = None  # macro | end | both
 
 
@@ -144,6 +145,7 @@ class WireFaults:
     def __init__(self) -> None:
         self._active: list[Fault] = []
         self.is_clean = True  # frames pass untouched
+        self.struck_count = 0  # frames that did not
         self._left: dict[int, int] = {}  # frames that a counted fault still takes, by id of the fault object
 
     @property
@@ -166,6 +168,7 @@ class WireFaults:
         copies = [(0, payload)]
         for fault in list(self._active):
             if fault.kind == "bus_off":
+                self.struck_count += 1
                 return []
             if fault.can_id != can_id:
                 continue
@@ -174,6 +177,7 @@ class WireFaults:
                 if left <= 0:
                     continue
                 self._left[id(fault)] = left - 1
+            self.struck_count += 1
             if fault.kind == "drop_frame":
                 return []
             if fault.kind == "delay_frame":

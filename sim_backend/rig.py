@@ -389,7 +389,7 @@ class Rig:
             node.change_object(fault.index or 0, fault.subindex or 0, fault.value or 0)
         elif fault.kind == "encoder_jump":
             offset_m = fault.offset_m or 0.0
-            node.drive.servo_parameters["encoder_offset_m"] += offset_m if begins else -offset_m
+            node.drive.shift_encoder(offset_m if begins else -offset_m)
         elif fault.kind == "flood" and begins:
             self._collect(t_ns, [(fault.can_id or 0, bytes(8))] * (fault.count or 0))
 
@@ -414,8 +414,10 @@ class Rig:
     def _disturb_once(self, fault: Fault) -> None:
         interferometer = self.interferometer
         if fault.kind == "garbage":
+            count = fault.count or 1
             # 0x47 = G, never a sync byte, a digit or a line end
-            interferometer.garbage = bytes(0x47 + k % 13 for k in range(fault.count or 1))
+            letters = bytes(0x47 + k % 13 for k in range(count))
+            interferometer.garbage = letters if fault.seed is None else np.random.default_rng(fault.seed).bytes(count)
         elif fault.kind == "half_line":
             interferometer.next_line_length = fault.length_count
         elif fault.kind == "sequence_gap":

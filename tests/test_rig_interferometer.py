@@ -205,6 +205,16 @@ def test_stuck_silent_skipping_and_garbled_lines():
     assert int.from_bytes(lines[-1][1][2:6], "little") < 25  # began again at zero
 
 
+def test_garbage_of_a_seed_is_bytes_of_every_kind_and_the_same_again():
+    first, again, other = (
+        lines_of(Rig(load_machine("oled-printer"), seed=3, faults=[Fault("garbage", count=2000, seed=seed)]), 3)[0][1]
+        for seed in (5, 5, 6)
+    )
+    assert first == again
+    assert first != other
+    assert len(set(first[:2000])) == 256  # sync bytes, digits and line ends among them
+
+
 def test_umd2_machine_writes_lines_and_a_single_axis_eight_fields():
     line = lines_of(Rig(load_machine("oled-printer-umd2"), seed=1), 5)[0][1]
     assert len(line.split()) == 16

@@ -14,7 +14,12 @@ from tests.faults.judge import Record, Verdict, judge
 from tests.faults.kinds import KINDS, MOVING, PHASES, Drawn
 from tests.faults.scene import Scene
 
-_ONLY = {"client vanishes": ("jogging", *MOVING, "at rest", "identifying", "homing")}
+_IN_TURN = {  # kinds whose phases come in turn: mostly the one that they are there for, or none is left to chance
+    "client vanishes": tuple(
+        phase for other in ("at rest", *MOVING, "identifying", "homing") for phase in ("jogging", other)
+    ),
+    "obstacle (following error)": ("constant speed", "jogging", "accelerating", "decelerating", *PHASES),
+}
 
 
 @dataclass(frozen=True)
@@ -43,8 +48,9 @@ def drawn(seed: int) -> tuple[str, str, Drawn, np.random.Generator]:
     rng = np.random.default_rng([seed, 5])
     names = list(KINDS)
     kind = names[seed % len(names)]
-    phases = _ONLY.get(kind, PHASES)
-    phase = phases[int(rng.integers(len(phases)))]
+    phase = PHASES[int(rng.integers(len(PHASES)))]
+    if kind in _IN_TURN:
+        phase = _IN_TURN[kind][seed // len(names) % len(_IN_TURN[kind])]
     return kind, phase, KINDS[kind](rng, phase), rng
 
 

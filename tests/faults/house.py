@@ -22,6 +22,7 @@ from tests.service.daemon import PATIENT, Daemon
 CHANGES = {**PATIENT, "macro.homing.speed_m_per_s": 0.1, "macro.homing.acceleration_m_per_s2": 0.5}
 LOOK_S = 0.02
 JOG_M_PER_S = 0.12
+JOG_HOLD_S = 0.5
 IDENTIFY_S = 4.0
 _PATIENCE_S = 120.0
 _UNDER_WAY_S = 10.0
@@ -40,6 +41,7 @@ class House:
         self.accepted: list[str] = []
         self._jogging = threading.Event()
         self._over = threading.Event()
+        self._mute = threading.Event()
         self._speed_m_per_s = 0.0
         self._channel = ""
 
@@ -111,6 +113,7 @@ class House:
     def _keep_lease(self) -> None:
         self._over.set()
         self._over = threading.Event()
+        self._mute.clear()
         threading.Thread(target=self._operate, args=(self._over,), daemon=True).start()
 
     def _operate(self, over: threading.Event) -> None:
@@ -119,11 +122,13 @@ class House:
         with Client(self.daemon.socket) as client:
             client.lease_token = self.daemon.client.lease_token
             while not over.wait(0.1):
+                if self._mute.is_set():
+                    continue
                 try:
                     client.renew_lease()
                     if self._jogging.is_set():
-                        jog = jog or client.begin_jog(0.5).key
-                        client.jog_at(jog, self._speed_m_per_s, 0.5)
+                        jog = jog or client.begin_jog(JOG_HOLD_S).key
+                        client.jog_at(jog, self._speed_m_per_s, JOG_HOLD_S)
                 except JogOver:
                     jog = ""
                 except LinkError:
@@ -183,9 +188,9 @@ class House:
         """Hold no key any more."""
         self._jogging.clear()
 
-    def vanish(self) -> None:
-        """The operator's program is gone."""
-        self._over.set()
+    def vanish(self, half_open: bool = False) -> None:
+        """The operator's program is gone; `half_open`: as one that hangs, or behind a cut cable, its socket stays."""
+        (self._mute if half_open else self._over).set()
         self.daemon.client.lease_token = ""
 
     # ---- judging -------------------------------------------------------------------------------------------------
@@ -198,6 +203,7 @@ class House:
                 reader = pa.ipc.open_stream(file)
                 for batch in reader:
                     t_ns = batch.column("t_ns").to_numpy()
-                    late = batch.column("lateness_ns").to_numpy()[(t_ns >= since_t_ns) & (t_ns <= until_t_ns)]
-                    worst = max(worst, int(late.max(initial=0)))
+                    late = batch.column("lateness_ns").to_numpy()
+                    due = (t_ns >= since_t_ns) & (t_ns - late <= until_t_ns)  # a cycle that was due by then
+                    worst = max(worst, int(late[due].max(initial=0)))
         return 1e-9 * worst

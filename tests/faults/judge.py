@@ -21,11 +21,15 @@ back, against a drive that holds; when it is gone the drive comes back to where 
 that way, which is the overshoot of its position loop, and by what its integral was wound up to meanwhile. That is at
 most the rest of its greatest force, F / m - w^2 e at e from its goal, and throws it F / (m w^2) - e beyond. All that is
 a spring, no command: only forward travel is judged until the obstacle is gone and the loop stands, by the same bound;
-from there on the macro must stand as after any fault.
+from there on the macro must stand as after any fault. A drive whose encoder jumps goes with it, there and back, with
+that overshoot: it holds on nothing else. By how much more such an encoder misleads its ramp is no excuse.
+
+A motion that no fault stops, or none has stopped yet, is judged in `unstopped.py`; a stop that the operator asked for
+by the same bound with the law's ramp. Behind the acknowledgement nothing may move or get power until it is asked for.
 """
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,19 +38,18 @@ import pyarrow as pa
 
 from tests.faults.kinds import CYCLE_S, MACRO, MICRO, SILENCE_S, Drawn
 from tests.faults.limp import shorted_way_m
-from tests.faults.mechanics import Mechanics, mechanics_of
+from tests.faults.mechanics import REST_M_PER_S, SETTLING_M, STANDSTILL_M, Mechanics, mechanics_of
 from tests.faults.scene import PROFILE, Facts
+from tests.faults.unstopped import astray, moved_at_rest, not_at_rest, not_ended, silent_way_m
 from tests.faults.witness import ENABLED, STOPPING
 
-REST_M_PER_S = 1e-3
-STANDSTILL_M = 20e-6  # a drive that holds on its encoder gives way so far when a force changes
 REST_SAMPLES = 20
 SETTLED_SAMPLES = 200  # what a drive's position loop needs until it stands; part of the travel
-SETTLING_M = 200e-6  # and how far it may go in it
 RELEASED_SAMPLES = 500  # the same, where an obstacle had pushed it millimetres away: six times the integral's 80 ms
 OVERSHOOT = 0.2  # of the way back
 SLOPE_SAMPLES = 10  # over which an acceleration is taken
 BEGUN_CYCLES = 2
+ASKED_S = 0.023  # from an operator's word to the servo: the supervisor looks every 20 ms, and three cycles
 STOPS_GIVE_M = 8e-3
 SPEED_SHARE = 1.02  # of what the guard allows: its own speed is filtered
 LIMP_SHARE, LIMP_M = (
@@ -113,7 +116,7 @@ class Record:
         return int(t_ns[found[0]]) if found.size else None
 
 
-_WANTED = ("t_ns", "run_phase", "stop", "setpoint_velocity_m_per_s")
+_WANTED = ("t_ns", "run_phase", "stop", "setpoint_position_m", "setpoint_velocity_m_per_s")
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
@@ -140,6 +143,8 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     noticed = noticed if noticed is not None and noticed < facts.judged_until_t_ns else None
     stopped = bool(facts.fault_kind) or noticed is not None
     found: list[tuple[str, str]] = []
+    if not facts.struck:
+        found.append((COURSE, "the fault never struck: what there is says nothing of it"))
     if drawn.must_stop and not facts.fault_kind and facts.phase not in AT_WILL:
         found.append((COURSE, "it went on"))
     if not drawn.may_stop and facts.fault_kind:
@@ -149,6 +154,16 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     if not facts.fault_kind and facts.phase in ("stopping", "idle"):  # a homing takes power away and gives it again
         at = int(np.searchsorted(t_ns, facts.fault_t_ns))
         found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
+    if not facts.fault_kind:
+        found += _unstopped(facts, record, of)
+    elif noticed is not None and not np.isfinite(drawn.detection_s):
+        found += [(TRAVEL, text) for text in astray(facts, record.columns, noticed, of)]
+    if drawn.silent and facts.phase == "jogging":
+        way_m, silent_m = silent_way_m(facts, facts.fault_t_ns, end, of)
+        if not way_m <= silent_m:
+            found.append((TRAVEL, f"nobody held its key: macro went {way_m * 1e3:.3f} mm, bound {silent_m * 1e3:.3f}"))
+    for from_t_ns, until_t_ns in facts.unasked:
+        found += [(STANDSTILL, text) for text in moved_at_rest(seen, from_t_ns, until_t_ns)]
     if facts.fault_kind and not _had_power(seen, facts.fault_t_ns, noticed, end):
         at = int(np.searchsorted(t_ns, facts.fault_t_ns))
         found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
@@ -160,7 +175,8 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         dark = MACRO in drawn.without_power
         rest = _rest(seen, at, end, noticed)
         stands, rests = _stands(seen, rest, end), end if rest is None else rest
-        back_m = 0.0
+        shifted_m = (1.0 + OVERSHOOT) * drawn.encoder_m
+        back_m = shifted_m
         if drawn.pushed:
             free = min(int(np.searchsorted(t_ns, facts.fault_t_ns + round(1e9 * drawn.lasts_s))), end)
             stands = min(max(stands, free + RELEASED_SAMPLES), end)
@@ -188,9 +204,9 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         held_m, drift_m = _moved_after(seen, stands, end)
         if rest is not None and not drawn.pushed:
             settled_m = float(np.abs(position[rest:stands] - position[rest]).max(initial=0.0))
-            if settled_m > SETTLING_M:
+            if settled_m > SETTLING_M + shifted_m:
                 found.append((STANDSTILL, f"macro moved {settled_m * 1e6:.0f} um while it settled"))
-        if held_m > STANDSTILL_M:
+        if held_m > STANDSTILL_M + shifted_m:
             found.append((STANDSTILL, f"macro moved {held_m * 1e6:.0f} um after standstill, with power"))
         if noticed is not None and not dark:
             heard = noticed if MACRO not in drawn.deaf else max(noticed, facts.fault_t_ns + round(1e9 * SILENCE_S))
@@ -205,6 +221,27 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     if facts.trouble:
         found.append((BACK, facts.trouble))
     return Verdict(tuple(found), stopped, travel_m, bound_m, begun, lost, drift_m)
+
+
+def _unstopped(facts: Facts, record: Record, of: Mechanics) -> list[tuple[str, str]]:
+    """Judge a run in which nothing stopped the motion but its own end, or the operator."""
+    found = [(STANDSTILL, text) for text in not_at_rest(facts)]
+    found += [(TRAVEL, text) for text in astray(facts, record.columns, facts.judged_until_t_ns, of)]
+    found += [(TRAVEL, text) for text in not_ended(facts, record.columns, of)]
+    if facts.stop_asked_t_ns:
+        seen = facts.seen
+        at, end = (int(np.searchsorted(seen["t_ns"], t)) for t in (facts.stop_asked_t_ns, facts.judged_until_t_ns))
+        off = np.flatnonzero(~np.isin(seen["states"][at:end, 0], _POWERED))
+        end = at + int(off[0]) + 1 if off.size else end  # at rest its power is taken, and it may roll
+        position, speed = seen["macro_position_m"][at:end], np.abs(seen["macro_velocity_m_per_s"][at:end])
+        way_m = float(np.abs(position - position[0]).max(initial=0.0))
+        by_law = replace(of, ramp_m_per_s2=of.law_ramp_m_per_s2)
+        bound_m = _bound_m(seen["t_ns"], seen["macro_velocity_m_per_s"], at, ASKED_S + facts.late_s, by_law)
+        if not way_m <= bound_m + STANDSTILL_M:
+            found.append((TRAVEL, f"macro went {way_m * 1e3:.3f} mm behind a stop, bound {bound_m * 1e3:.3f} mm"))
+        if not speed[-1] < REST_M_PER_S:
+            found.append((STANDSTILL, f"macro was let go of, or went on, at {speed[-1]:.3f} m/s behind a stop"))
+    return found
 
 
 def _bound_m(

@@ -14,6 +14,7 @@ from sim_backend.faults import Fault
 MACRO, MICRO = 1, 2  # node ids
 SYNC, MACRO_TPDO, MICRO_TPDO, MACRO_RPDO, MICRO_RPDO = 0x080, 0x181, 0x182, 0x201, 0x202
 MASTER_HEARTBEAT = 0x77E
+EMCYS = (0x081, 0x082)
 CYCLIC = (SYNC, MACRO_TPDO, MICRO_TPDO, MACRO_RPDO, MICRO_RPDO)
 TPDOS, RPDOS = (MACRO_TPDO, MICRO_TPDO), (MACRO_RPDO, MICRO_RPDO)
 
@@ -25,6 +26,7 @@ _HEARTBEAT_S = 0.265  # trip.heartbeat_s, a heartbeat's own period, and two look
 _MASTER_HEARTBEAT_S = 0.205
 _SUPERVISOR_S = 0.5 + 2 * CYCLE_S
 _LEASE_S = 2.0  # what a lease lasts that nobody renews
+JOG_HOLD_S = 0.3  # for how long a word of a jog's operator holds
 FRAME_S = 130e-6  # eight bytes at 1 Mbit/s
 NEVER_S = float("inf")
 
@@ -49,10 +51,17 @@ class Drawn:
     without_power: tuple[int, ...] = ()  # nodes that can't brake
     deaf: tuple[int, ...] = ()  # nodes that hear no command: their own watch stops them
     open_loop: bool = False  # the drive keeps its last force until the fault is noticed
+    silent: bool = False  # the operator says nothing more: a jog ends by its own hold, before the lease does
+    encoder_m: float = 0.0  # by which the drive's own encoder is off for a while: it holds on that
     pushed: bool = False  # by something that is no command: how far is not judged
 
 
 Draw = Callable[[np.random.Generator, str], Drawn]
+
+
+def grave(rng: np.random.Generator) -> bool:
+    """Draw whether a fault is one that must stop the stage, as often as one that may go by."""
+    return bool(rng.random() < 0.5)
 
 
 def one_of(rng: np.random.Generator, values):
@@ -83,8 +92,13 @@ def frames_lost(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def few_frames_lost(rng: np.random.Generator, phase: str) -> Drawn:
-    ids = (*CYCLIC, 0x081, 0x082, 0x281, 0x282)
-    can_id, count = one_of(rng, ids), int(rng.integers(1, 4))
+    can_id, count = one_of(rng, (*CYCLIC, *EMCYS)), int(rng.integers(1, 4))
+    if can_id in EMCYS:  # no drive sends one without trouble; its statusword is all that says so then
+        node_id = can_id & 0x7F
+        lost = Fault("drop_frame", can_id=can_id, duration_s=0.3)
+        trouble = Fault("emergency", at_s=CYCLE_S, node_id=node_id, code=0x2310)
+        text = f"EMCY 0x2310 of node {node_id} lost"
+        return Drawn(text, (lost, trouble), detection_s=AT_ONCE_S + CYCLE_S, lasts_s=0.3)
     fault = Fault("drop_frame", can_id=can_id, count=count, duration_s=0.3)
     return Drawn(f"{count} frames 0x{can_id:03X} lost", (fault,), must_stop=False, lasts_s=0.3)
 
@@ -214,15 +228,20 @@ def master_heartbeat_lost(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def encoder_glitch(rng: np.random.Generator, phase: str) -> Drawn:
-    """Counts appear from nowhere; what is less than 50 um and a period's way is not told apart from jitter."""
-    offset_m, duration_s = between(rng, 5e-6, 5e-3) * one_of(rng, (-1.0, 1.0)), between(rng, 1e-3, 0.5)
-    must = abs(offset_m) > 1.2e-3 and duration_s > 0.03
+    """Counts appear from nowhere; what is less than 50 um and a period's way is not told apart from jitter.
+
+    In a homing the lasers have no zero yet that the encoder could be held against.
+    """
+    must, sign = grave(rng) and phase != "homing", one_of(rng, (-1.0, 1.0))
+    offset_m = sign * (between(rng, 1.2e-3, 5e-3) if must else between(rng, 5e-6, 1.2e-3))
+    duration_s = between(rng, 0.03, 0.5) if must else between(rng, 1e-3, 0.5)
     return Drawn(
         f"macro encoder off by {offset_m * 1e6:.0f} um for {duration_s * 1e3:.0f} ms",
         (Fault("encoder_jump", node_id=MACRO, offset_m=offset_m, duration_s=duration_s),),
         must_stop=must,
         detection_s=0.02 if must else NEVER_S,
         lasts_s=duration_s,
+        encoder_m=abs(offset_m),
     )
 
 
@@ -235,8 +254,8 @@ def beam_break(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def sensor_silence(rng: np.random.Generator, phase: str) -> Drawn:
-    duration_s = between(rng, 1e-3, 0.8)
-    must = duration_s > SILENCE_S + 5e-3
+    must = grave(rng)
+    duration_s = between(rng, SILENCE_S + 5e-3, 0.8) if must else between(rng, 1e-3, SILENCE_S + 5e-3)
     return Drawn(
         f"interferometer silent for {duration_s * 1e3:.0f} ms",
         (Fault("sensor_silence", duration_s=duration_s),),
@@ -249,7 +268,7 @@ def sensor_silence(rng: np.random.Generator, phase: str) -> Drawn:
 def sensor_garbage(rng: np.random.Generator, phase: str) -> Drawn:
     count = round(between(rng, 1, 4000))
     lines = int(rng.integers(0, 15))
-    faults = [Fault("garbage", count=count)]
+    faults = [Fault("garbage", count=count, seed=int(rng.integers(1 << 30)))]
     faults += [Fault("half_line", at_s=k * CYCLE_S, length_count=int(rng.integers(0, 25))) for k in range(lines)]
     return Drawn(f"{count} bytes of garbage, {lines} half lines", tuple(faults), must_stop=False, lasts_s=0.1)
 
@@ -320,8 +339,8 @@ def obstacle(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def host_held_up(rng: np.random.Generator, phase: str) -> Drawn:
-    duration_s = between(rng, 5e-3, 0.5)
-    must = duration_s > SILENCE_S + 2e-3
+    must = grave(rng)
+    duration_s = between(rng, SILENCE_S + 2e-3, 0.5) if must else between(rng, 5e-3, SILENCE_S + 2e-3)
     return Drawn(
         f"host held up for {duration_s * 1e3:.0f} ms",
         act=lambda scene: scene.hold_host_up(duration_s),
@@ -332,8 +351,8 @@ def host_held_up(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def supervisor_hangs(rng: np.random.Generator, phase: str) -> Drawn:
-    duration_s = float(rng.uniform(0.05, 1.2))
-    must = duration_s > 0.52
+    must = grave(rng)
+    duration_s = float(rng.uniform(0.52, 1.2) if must else rng.uniform(0.05, 0.52))
     return Drawn(
         f"supervisor hangs for {duration_s * 1e3:.0f} ms",
         act=lambda scene: scene.hang_supervisor(duration_s),
@@ -352,7 +371,7 @@ def disk_full(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def client_vanishes(rng: np.random.Generator, phase: str) -> Drawn:
-    return Drawn("client vanishes", act=lambda scene: scene.vanish(), detection_s=_LEASE_S + CYCLE_S)
+    return Drawn("client vanishes", act=lambda scene: scene.vanish(), detection_s=_LEASE_S + CYCLE_S, silent=True)
 
 
 def second_operator(rng: np.random.Generator, phase: str) -> Drawn:

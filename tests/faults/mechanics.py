@@ -12,6 +12,10 @@ from stagectl.profile import PROFILES_FOLDER
 
 _PLAN_SHARE, _PLAN_RAMP_SHARE, _JERK_TIME_S = 0.9, 0.5, 0.1  # what moves are planned with
 _TOUCH_N = 5.0  # no joint is pressed harder
+REST_M_PER_S = 1e-3
+STANDSTILL_M = 20e-6  # a drive that holds on its encoder gives way so far when a force changes
+SETTLING_M = 200e-6  # how far its position loop may go until it stands
+_KICK_S = 1e-3  # for which a wrong force is a drive's target: the next command takes it back
 
 
 @dataclass(frozen=True)
@@ -20,11 +24,13 @@ class Mechanics:
 
     machine: Machine
     ramp_m_per_s2: float  # the drive's, 0x6085
+    law_ramp_m_per_s2: float  # of a stop that the operator asked for: the law brakes, half as hard
     plan_m_per_s2: float  # what its moves are planned with
     plan_m_per_s3: float
     speed_limit_m_per_s: float  # the guard's
     force_limit_n: float  # of the macro's drive, 0x6072
     travel_m: tuple[float, float]  # in which the guard wants to be able to stop it
+    error_limit_m: float  # of the end, at which the guard stops a motion
 
     def _of(self, name: str) -> list[dict]:
         return [row for row in self.machine.effects if row["name"] == name]
@@ -43,6 +49,11 @@ class Mechanics:
         """How far the macro's drive gives way under its greatest force while it holds on its encoder: F / (m w^2)."""
         w = float(drive_servo.parameters(self.machine.macro)["bandwidth_rad_per_s"][0])
         return self.force_limit_n / (self.machine.macro.mass_kg * w * w)
+
+    @property
+    def kick_m_per_s(self) -> float:
+        """How much faster the macro gets by its greatest force in a cycle, as one frame that is not the law's asks."""
+        return self.force_limit_n / self.machine.macro.mass_kg * _KICK_S
 
     def coasting_m_per_s(self, position_m: float, velocity_m_per_s: float) -> float:
         """Return how fast a macro may get that loses its power there: the guard's limit, and what it rolls down."""
@@ -69,9 +80,11 @@ def mechanics_of(name: str) -> Mechanics:
     return Mechanics(
         load_machine(name),
         ramp,
+        _PLAN_RAMP_SHARE * ramp,
         plan,
         plan / _JERK_TIME_S,
         macro["velocity_limit_m_per_s"],
         macro["force_limit_n"],
         (low_m - stray_m, high_m + stray_m),
+        stray_m,
     )

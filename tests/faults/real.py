@@ -15,12 +15,12 @@ import pytest
 
 from stagectl.errors import LinkError, RecordError, StagectlError
 from stagectl.record import read_run
-from tests.faults.house import IDENTIFY_S, LOOK_S, House
+from tests.faults.house import IDENTIFY_S, JOG_HOLD_S, LOOK_S, House
 from tests.faults.judge import AT_WILL, BACK, BEGUN, COURSE, REST_M_PER_S, Record, judge
 from tests.faults.kinds import MACRO, MICRO, one_of
 from tests.faults.mechanics import mechanics_of
 from tests.faults.real_kinds import KINDS, Real
-from tests.faults.scene import Facts
+from tests.faults.scene import TOP_M_PER_S, Facts
 from tests.small_disk import small_disk
 
 HICCUP_S = 0.02  # 20 cycles, and the drives say that SYNC is lost
@@ -36,6 +36,7 @@ _PHASES = {  # for how long a fault may wait in each, and how often one is drawn
     "stopping": (0.1, 1),
     "idle": (0.5, 1),
 }
+_IN_TURN = {"client vanishes": ("jogging", "at rest", "jogging", "jogging", "moving")}  # mostly what it is there for
 _TOUCHING_S = 2.0  # of a homing with a micro
 _REST_S, _OVER_S, _NEVER_RESTS_S = 0.2, 0.6, 10.0
 _TRIES = 3
@@ -92,6 +93,8 @@ def drawn(seed: int) -> Scenario:
     nodes = _STAGES[profile]
     phases = [name for name in _PHASES if name != "identifying" or MICRO in nodes]
     phase = one_of(rng, [name for name in phases for _ in range(_PHASES[name][1])])
+    if kind in _IN_TURN:
+        phase = _IN_TURN[kind][seed // len(KINDS) % len(_IN_TURN[kind])]
     longest_s = _PHASES[phase][0] + (_TOUCHING_S if phase == "homing" and MICRO in nodes else 0.0)
     wait_s = float(rng.uniform(0.0, longest_s))
     speed_m_per_s = float(rng.uniform(0.05, 0.25))
@@ -166,20 +169,21 @@ def _play(house: House, scenario: Scenario) -> Facts | str:
         house.let_go()
     else:
         return trouble
-    facts = Facts(begun_t_ns=begun_t_ns, phase=scenario.phase)
+    facts = Facts(begun_t_ns=begun_t_ns, phase=scenario.phase, jog_hold_s=JOG_HOLD_S)
+    facts.planned_m_per_s = {"jogging": scenario.speed_m_per_s, "moving": TOP_M_PER_S}.get(scenario.phase, 0.0)
     before, drawn_fault = house.state(), scenario.fault.drawn
     facts.fault_t_ns = house.t_ns()
     assert drawn_fault.act is not None
     drawn_fault.act(house)
-    end = _watched(house, scenario, before)
+    held_up_s = _watched(house, scenario, before)
     house.let_go()
     facts.judged_until_t_ns = int(house.seen["t_ns"][-1])
     _name_fault(house, scenario, facts)
-    held_up_s = 1e-9 * (end["held_up_ns"] - before["held_up_ns"])
     time.sleep(0.3 if drawn_fault.lasts_s else 0.0)
     facts.trouble = house.ready()
-    detection_s = drawn_fault.detection_s if np.isfinite(drawn_fault.detection_s) else _OVER_S
-    until_t_ns = facts.fault_t_ns + round(1e9 * (detection_s + drawn_fault.lasts_s))
+    until_t_ns = facts.judged_until_t_ns
+    if np.isfinite(drawn_fault.detection_s):
+        until_t_ns = facts.fault_t_ns + round(1e9 * (drawn_fault.detection_s + held_up_s))
     servo_late_s = house.lateness_s(facts.fault_t_ns, until_t_ns)
     facts.late_s = held_up_s + WAKE_S + (0.0 if scenario.fault.by_drives else servo_late_s)
     facts.accepted = house.accepted
@@ -208,18 +212,19 @@ def _name_fault(house: House, scenario: Scenario, facts: Facts) -> None:
         facts.fault_kind, facts.fault_text = fault.kind, fault.values
 
 
-def _watched(house: House, scenario: Scenario, state: dict) -> dict:
-    """Follow the true motion until the fault must have had its effect, and the macro rests; return the last state.
+def _watched(house: House, scenario: Scenario, before: dict) -> float:
+    """Follow the true motion until the fault must have had its effect, and the macro rests.
 
-    What the rig saw is fetched as soon as the macro rests: a service that lost its servo lets go of that world, and
-    the rig goes with it.
+    What the rig saw is fetched as soon as the macro rests, and no sooner: a service that lost its servo lets go of that
+    world, and the rig goes with it; but to write it all holds the rig up for 20 ms. Returns for how long the rig was
+    held up until the fault must have been noticed, in s: what it was later is no excuse.
     """
     fault = scenario.fault.drawn
     detection_s = fault.detection_s if np.isfinite(fault.detection_s) else 0.0
     least_s = max(fault.lasts_s, detection_s) + _OVER_S
     rests_not = not fault.must_stop or MACRO in fault.without_power or scenario.phase == "idle"
     begin_s, rested_s, kept = time.monotonic(), 0.0, False
-    house.look_back()
+    before_ns, held_up_s, noticed = before["held_up_ns"], 0.0, False
     while True:
         try:
             state = house.state()
@@ -227,13 +232,18 @@ def _watched(house: House, scenario: Scenario, state: dict) -> dict:
             slow = abs(state["plant"]["macro_velocity_m_per_s"]) < REST_M_PER_S
             rested_s = (rested_s or now_s) if slow else 0.0
             rests = bool(rested_s) and now_s - rested_s > _REST_S
+            watched_s = now_s - begin_s
+            if not noticed:
+                held_up_s = 1e-9 * (state["held_up_ns"] - before_ns)
+                noticed = rests or (np.isfinite(fault.detection_s) and watched_s > detection_s + held_up_s)
             if rests and not kept:
                 house.look_back()
                 kept = True
-            watched_s = now_s - begin_s
             if (watched_s > least_s and (rests or rests_not)) or watched_s > least_s + _NEVER_RESTS_S:
                 house.look_back()
-                return state
+                return held_up_s
         except LinkError:
-            return state
+            if not kept:
+                raise HostHeldUp("the rig was gone before its macro rested: what it did there is unknown") from None
+            return held_up_s
         time.sleep(LOOK_S)

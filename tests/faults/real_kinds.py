@@ -25,7 +25,7 @@ AT_ONCE_S = 3 * CYCLE_S
 SENSOR_S, RPDO_S, HEARTBEAT_S, LEASE_S, SUPERVISOR_S = 0.3, 0.1, 2.0, 2.0, 0.5  # as the profile has them
 _LOOKS_AWAY_S = 1.5
 DISK_S = 0.5  # rows go onto the disk every 0.25 s; the supervisor hears with the next ones that it took none
-_CASES_COUNT = 3  # of every operation of the API, with data that fit and with data that don't
+_CASES_COUNT = 3  # of every operation of the API, with data that fit and with data that don't; one as who may not
 _NO_LEASE = ("/v1/record", "/v1/record/trigger")
 
 
@@ -110,8 +110,10 @@ def killed_both(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
 
 
 def client_vanishes(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
-    """A client's program ends while it holds the key."""
-    return Real(Drawn("client vanishes", act=lambda house: house.vanish(), detection_s=LEASE_S))
+    """A client's program ends while it holds the key, or says nothing more on a socket that stays open."""
+    half_open = bool(rng.random() < 0.5)
+    text = "client vanishes, its socket stays open" if half_open else "client vanishes"
+    return Real(Drawn(text, act=lambda house: house.vanish(half_open), detection_s=LEASE_S, silent=True))
 
 
 def _of_rig(text: str, faults: dict, **known) -> Real:
@@ -203,7 +205,8 @@ def hostile_clients(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
 
 
 def hostile_requests(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
-    return _harmless("hostile API (schemathesis)", hostile_api)
+    seed = int(rng.integers(1 << 30))
+    return _harmless("hostile API (schemathesis)", lambda house: hostile_api(house, seed))
 
 
 def disk_full(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
@@ -262,31 +265,40 @@ def hostile_bytes(house: House, seed: int) -> None:
             one.recv(1000)
 
 
-def hostile_api(house: House) -> None:
+def hostile_api(house: House, seed: int) -> None:
     """Everything that the OpenAPI document allows, and what it doesn't, over TCP, beside the one who holds the lease.
 
-    `stop` is left out: anybody may. What needs the lease must be refused, and nothing may end in a server error.
+    `stop` is left out: anybody may. What needs the lease must be refused, and nothing may end in a server error. Who
+    may only watch commands nothing, not even what needs no lease; without a token, or with a wrong one, nothing at all
+    is answered.
     """
     import schemathesis
     from hypothesis import HealthCheck, Phase, given, settings
+    from hypothesis import seed as drawn_from
     from hypothesis.errors import Unsatisfiable
     from schemathesis import GenerationMode
 
     tokens = read_tokens(house.daemon.state / "tokens")
     url = f"http://127.0.0.1:{house.daemon.tcp_port}"
-    headers = {"Authorization": f"Bearer {tokens[Role.OPERATE]}"}
-    document = httpx.get(f"{url}/openapi.json", headers=headers, trust_env=False).json()
-    for mode in (GenerationMode.POSITIVE, GenerationMode.NEGATIVE):
+    operate, observe = ({"Authorization": f"Bearer {tokens[role]}"} for role in (Role.OPERATE, Role.OBSERVE))
+    document = httpx.get(f"{url}/openapi.json", headers=operate, trust_env=False).json()
+    for headers, mode, cases_count in (
+        (operate, GenerationMode.POSITIVE, _CASES_COUNT),
+        (operate, GenerationMode.NEGATIVE, _CASES_COUNT),
+        (observe, GenerationMode.POSITIVE, 1),
+        ({}, GenerationMode.POSITIVE, 1),
+        ({"Authorization": "Bearer guessed"}, GenerationMode.POSITIVE, 1),
+    ):
         for result in schemathesis.openapi.from_dict(document).get_all_operations():
             operation = result.ok()
             if operation.path == "/v1/stop":
                 continue
 
+            @drawn_from(seed)
             @settings(
-                max_examples=_CASES_COUNT,
+                max_examples=cases_count,
                 deadline=None,
                 database=None,
-                derandomize=True,
                 phases=[Phase.explicit, Phase.generate],
                 suppress_health_check=list(HealthCheck),
             )
@@ -294,11 +306,13 @@ def hostile_api(house: House) -> None:
             def once(case):
                 if "wait_s" in (case.query or {}):
                     case.query["wait_s"] = 0
-                answer = case.call(base_url=url, headers=headers, timeout=10)
+                answer = case.call(base_url=url, headers=headers, timeout=10)  # noqa: B023
                 label = f"{case.operation.label}: {answer.status_code}"
                 if answer.status_code >= 500 and answer.status_code != 503:  # 503: beyond 100 connections
                     house.accepted.append(label)
-                if case.method != "GET" and answer.status_code < 300 and case.operation.path not in _NO_LEASE:
+                free = headers is operate and case.operation.path in _NO_LEASE  # noqa: B023
+                known = headers is operate or headers is observe  # noqa: B023
+                if answer.status_code < 300 and not free and (case.method != "GET" or not known):
                     house.accepted.append(label)
 
             with contextlib.suppress(Unsatisfiable):

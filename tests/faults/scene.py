@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sim_backend.faults import BUS_KINDS
 from sim_backend.machine import load_machine
 from stagectl import stage as stages
 from stagectl.backend import BatchBackend, ServoLink
@@ -21,7 +22,7 @@ from stagectl.service.remembered import Remembered
 from stagectl.service.service_log import ServiceLog
 from stagectl.service.stage_loop import StageLoop
 from stagectl.service.stage_state import Settings
-from tests.faults.kinds import NONSENSE, Drawn, one_of
+from tests.faults.kinds import JOG_HOLD_S, NONSENSE, Drawn, one_of
 from tests.faults.witness import WitnessedRig
 from tests.small_disk import small_disk
 from tests.struck_stage import home_by_truth
@@ -30,7 +31,7 @@ from tests.toml_text import changed
 PROFILE = "oled-printer"
 _HOMING = {"macro.homing.speed_m_per_s": 0.1, "macro.homing.acceleration_m_per_s2": 0.5}
 _RENEW_NS, _PRESS_NS = 300_000_000, 100_000_000
-_TOP_M_PER_S = 0.449  # moves are planned to 0.9 of the profile's 0.5
+TOP_M_PER_S = 0.449  # moves are planned to 0.9 of the profile's 0.5
 _PATIENCE_S = 15.0  # of the rig's time: to a standstill, and from a fault to the next state
 _TRIES = 4
 _DISK_BYTES = 24 << 20
@@ -57,10 +58,17 @@ class Facts:
     judged_until_t_ns: int = 0  # the acknowledgement, or the end of watching
     begun_t_ns: int = 0
     phase: str = ""
+    struck: bool = True  # the fault did something
     trouble: str = ""  # why the stage could not be armed again; empty where it could
     fault_kind: str = ""
     fault_text: str = ""
     late_s: float = 0.0  # by which a host held up who had to notice it
+    planned_m_per_s: float = 0.0  # how fast what was asked for may be
+    target_m: float | None = None  # of a move
+    stop_asked_t_ns: int = 0  # by the operator, while it moved; 0 = not
+    jog_hold_s: float = JOG_HOLD_S
+    said_t_ns: int = 0  # the last word of a jog's operator: its key is held no longer; 0 = never
+    unasked: list[tuple[int, int]] = field(default_factory=list)  # behind the judged end: nobody asks for power
     accepted: list[str] = field(default_factory=list)  # of what nobody may ask
     seen: dict[str, np.ndarray] = field(default_factory=dict)
     sync_t_ns: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -89,6 +97,7 @@ class Scene:
         self._jog_key = ""
         self._due: Any = None  # says whether the fault is due
         self._fastest_m_per_s = 0.0
+        self._rests_t_ns = 0  # since when it rests and nothing was asked that gives power; 0: it was
         self._filler: Path | None = None
         self._gone = False  # the servo
         self._ended = False
@@ -203,7 +212,8 @@ class Scene:
 
     def _press(self) -> None:
         """Say the jog's velocity; begin one where none is under way."""
-        body = messages.JogAt(velocity_m_per_s=self._jog_m_per_s or 0.0, hold_s=0.3)
+        self.facts.said_t_ns = self.t_ns
+        body = messages.JogAt(velocity_m_per_s=self._jog_m_per_s or 0.0, hold_s=JOG_HOLD_S)
         try:
             self.desk.jog_at(self._jog_key, body, self._token)
         except JogOver:
@@ -328,14 +338,22 @@ class Scene:
         self.facts.begun_t_ns = self.t_ns
         self._set_off()
         self.until(lambda: self.facts.fault_t_ns > 0 and self._quiet(), 40.0)
+        self.facts.struck = self._struck()
         self.facts.judged_until_t_ns = self.t_ns
         fault = self.status.fault
         if fault is not None:
             self.facts.fault_kind, self.facts.fault_text = fault.kind, fault.values
+        self._rests_t_ns = self.t_ns
         self.facts.trouble = self._way_back()
+        self._ask_for_power()
         self.facts.seen = self.rig.seen()
         self.facts.sync_t_ns = self.facts.seen["sync_t_ns"]
         return self.facts
+
+    def _struck(self) -> bool:
+        """Tell whether the fault's instant came, and it met frames where it is one of the bus."""
+        of_bus = any(fault.kind in BUS_KINDS for fault in self.drawn.faults)
+        return self.facts.fault_t_ns > 0 and (not of_bus or self.rig.wire_faults.struck_count > 0)
 
     def _quiet(self) -> bool:
         """Tell whether the fault is gone, and what it did has come to its end."""
@@ -362,27 +380,32 @@ class Scene:
         self._due = lambda: self.t_ns >= due_t_ns
         if phase == "jogging":
             self._jog_m_per_s = sign * float(rng.uniform(0.05, 0.3))
+            self.facts.planned_m_per_s = abs(self._jog_m_per_s)
             self._press()
         elif phase == "identifying":
+            self.facts.planned_m_per_s = TOP_M_PER_S
             self.begin("identify", messages.Identify(duration_s=4.0))
         elif phase == "homing":
+            self.facts.planned_m_per_s = _HOMING["macro.homing.speed_m_per_s"]
             self.begin("home", messages.Home())
         elif phase != "at rest":
             self._due = lambda: self._in_phase(share)
-            self.begin("move", messages.Move(target_m=sign * float(rng.uniform(0.33, 0.42))))
+            self.facts.target_m, self.facts.planned_m_per_s = sign * float(rng.uniform(0.33, 0.42)), TOP_M_PER_S
+            self.begin("move", messages.Move(target_m=self.facts.target_m))
 
     def _in_phase(self, share: float) -> bool:
         """Tell whether a move is where the fault is to strike, by the true speed."""
         speed = abs(self.rig.plant_state()["macro_velocity_m_per_s"])
         self._fastest_m_per_s = max(self._fastest_m_per_s, speed)
         if self.phase == "accelerating":
-            return speed >= share * _TOP_M_PER_S
+            return speed >= share * TOP_M_PER_S
         if self.phase == "decelerating":
-            return self._fastest_m_per_s > 0.98 * _TOP_M_PER_S and speed <= share * _TOP_M_PER_S
-        if speed < 0.998 * _TOP_M_PER_S and self.phase == "constant speed":
+            return self._fastest_m_per_s > 0.98 * TOP_M_PER_S and speed <= share * TOP_M_PER_S
+        if speed < 0.998 * TOP_M_PER_S and self.phase == "constant speed":
             return False
-        if self.phase == "stopping" and self._fastest_m_per_s > share * _TOP_M_PER_S:
+        if self.phase == "stopping" and self._fastest_m_per_s > share * TOP_M_PER_S:
             if not self.desk.stop_asked and self.loop._state == "moving":
+                self.facts.stop_asked_t_ns = self.t_ns
                 self.desk.ask_to_stop("the operator")
             return speed < 0.9 * self._fastest_m_per_s
         return self.phase == "constant speed"
@@ -405,20 +428,29 @@ class Scene:
             return f"no lease: {self.status.lease}"
         fault = self.status.fault
         if fault is not None:
+            self._rests_t_ns = self._rests_t_ns or self.t_ns
             done = self.do("acknowledge", messages.Acknowledge(number=fault.number))
             if done is None or done.state != "done":
                 return f"not acknowledged: {done.text if done else self.status.state}"
         if not self.until(lambda: self.status.state in ("idle", "armed")):
             return f"still {self.status.state}: {self.status.waiting_for}"
         if not self.status.homed:
+            self._ask_for_power()
             homed = self.do("home", messages.Home())
             if homed is None or homed.stop != "FINISHED":
                 return f"not homed: {homed.text if homed else self.status.state}"
         if self.status.state == "idle":
+            self._ask_for_power()
             armed = self.do("arm", messages.Arm())
             if armed is None or armed.stop != "FINISHED":
                 return f"not armed: {armed.text if armed else self.status.state}"
         return "" if self.status.state == "armed" else f"{self.status.state}, not armed"
+
+    def _ask_for_power(self) -> None:
+        """Note until when nothing was asked for that gives power, since the stage came to rest."""
+        if self._rests_t_ns:
+            self.facts.unasked.append((self._rests_t_ns, self.t_ns))
+            self._rests_t_ns = 0
 
     def run_folders(self) -> Iterator[Path]:
         """Return all runs of the service that hold rows."""

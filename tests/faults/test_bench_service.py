@@ -97,6 +97,11 @@ def test_a_seed_with_real_processes_is_the_same_run_again_and_all_of_them_are_dr
     assert len({one.wait_s for one in drawn}) == len(drawn)
 
 
+def test_most_clients_that_vanish_do_so_while_they_jog():
+    phases = [one.phase for one in map(real.drawn, range(service_processes.FULL_RUNS)) if one.kind == "client vanishes"]
+    assert phases.count("jogging") > len(phases) / 2
+
+
 def test_the_bound_of_a_run_with_real_processes():
     """t = 0.1 + 0.001 + 0.01 s from 0.12 m/s, 5 m/s^2 of ramp: 13.32 + 1.44 mm; magnets, 2 N on 12 kg, 0.33 m/s^2."""
     t_ns = np.arange(1000) * 1_000_000
@@ -117,6 +122,8 @@ def test_the_seeded_part_has_every_process_killed_and_stopped_in_every_motion():
     assert len(kinds) == len(drawn) >= 10
     struck = {f"{name} {how}" for name in ("servo", "supervisor") for how in ("killed", "stopped")}
     assert struck | {"disk full", "two operators", "hostile API (schemathesis)", "client vanishes"} <= kinds
+    assert all(one.fault.drawn.must_stop for one in drawn if one.kind in struck)
+    assert {one.phase for one in drawn if one.kind == "client vanishes"} == {"jogging"}
     assert {one.phase for one in drawn} >= set(MOTIONS)
     assert len({one.profile for one in drawn}) == 2
 

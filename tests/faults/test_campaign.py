@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.service_batch import RUNS
 from tests.faults import campaign
 from tests.faults.judge import (
     BACK,
@@ -19,7 +20,7 @@ from tests.faults.judge import (
     Record,
     judge,
 )
-from tests.faults.kinds import KINDS, MACRO, MICRO, SILENCE_S, Drawn
+from tests.faults.kinds import KINDS, MACRO, MICRO, PHASES, SILENCE_S, Drawn
 from tests.faults.limp import shorted_way_m
 from tests.faults.mechanics import mechanics_of
 from tests.faults.scene import Facts
@@ -77,8 +78,40 @@ def rest_after(ramp_m_per_s2: float, noticed_s: float = 0.02) -> tuple[Facts, Re
         "t_ns": seen["t_ns"],
         "run_phase": np.where(noticed, 6, 4),
         "stop": np.where(noticed, 18, 0),
-        "setpoint_velocity_m_per_s": velocity,
+        "setpoint_position_m": position + 70e-6 - 12e-3,  # its zero is its own
+        "setpoint_velocity_m_per_s": velocity.copy(),
     }
+    return facts, record
+
+
+def unstopped(phase: str) -> tuple[Facts, Record]:
+    """Make the log of what no fault stopped: 0.4 m/s, to rest by the plan's 0.9 m/s^2, or a stage that holds.
+
+    Its end is reached at 1.5 s; 1 kHz, 2 s.
+    """
+    facts, record = rest_after(2.0)
+    t_s = facts.seen["t_ns"] * 1e-9
+    speed = np.zeros(2000) if phase == "at rest" else (0.4 - 0.9 * (t_s - 1.05).clip(min=0.0)).clip(min=0.0)
+    position = np.cumsum(speed) * 1e-3
+    facts.seen |= {
+        "macro_velocity_m_per_s": speed,
+        "macro_position_m": position,
+        "end_velocity_m_per_s": speed.copy(),
+        "end_position_m": position + 70e-6,
+    }
+    facts.seen["states"][:] = ENABLED
+    record.columns |= {
+        "run_phase": np.full(2000, 4),
+        "stop": np.zeros(2000, np.int64),
+        "setpoint_position_m": position + 70e-6 - 12e-3,
+        "setpoint_velocity_m_per_s": speed.copy(),
+    }
+    facts.phase, facts.fault_kind, facts.planned_m_per_s = phase, "", 0.4
+    facts.unasked = [(1_900_000_000, 1_990_000_000)]
+    if phase == "constant speed":
+        facts.target_m = float(position[-1] + 70e-6 - 12e-3)
+    if phase == "jogging":
+        facts.said_t_ns = 700_000_000
     return facts, record
 
 
@@ -274,3 +307,130 @@ def test_judges_see_what_should_not_have_happened():
     assert bars_missed(replace(facts, fault_kind=""), record) == {COURSE}
     assert bars_missed(replace(facts, accepted=["move"]), record) == {STRANGER}
     assert bars_missed(replace(facts, trouble="not homed"), record) == {BACK}
+
+
+GOES_BY = Drawn("frames doubled", must_stop=False, lasts_s=0.1)
+
+
+@pytest.mark.parametrize("phase", ["at rest", "constant speed", "jogging", "identifying"])
+def test_a_motion_that_nothing_stopped_misses_no_bar_where_it_is_the_one_that_was_asked_for(phase):
+    assert judge(GOES_BY, *unstopped(phase)).violations == ()
+
+
+def test_a_stage_that_holds_is_seen_to_move_without_a_fault_too():
+    facts, record = unstopped("at rest")
+    facts.seen["macro_position_m"][1200:] += 30e-6
+    assert bars_missed(facts, record, GOES_BY) == {STANDSTILL}
+    facts, record = unstopped("at rest")
+    for name in ("macro_position_m", "end_position_m"):
+        facts.seen[name][1200:] += 0.1
+    facts.seen["macro_velocity_m_per_s"][1150:1200] = 2.0
+    assert bars_missed(facts, record, GOES_BY) == {STANDSTILL, TRAVEL}
+
+
+@pytest.mark.parametrize("phase", ["constant speed", "jogging", "identifying"])
+def test_a_motion_that_leaves_its_reference_is_seen_without_a_fault_too(phase):
+    """The guard's limit is 200 um; 3 ms of 0.4 m/s until it can have noticed."""
+    for off_m, missed in ((1.3e-3, set()), (1.5e-3, {TRAVEL})):
+        facts, record = unstopped(phase)
+        facts.seen["end_position_m"][1100:1200] += off_m
+        assert bars_missed(facts, record, GOES_BY) == missed
+
+
+def test_a_reference_that_runs_away_with_the_stage_is_seen_by_its_speed_and_by_its_end():
+    facts, record = unstopped("constant speed")
+    facts.seen["macro_velocity_m_per_s"][1100:1200] = 0.45
+    assert bars_missed(facts, record, GOES_BY) == {TRAVEL}
+    facts, record = unstopped("constant speed")
+    facts.target_m = (facts.target_m or 0.0) - 30e-6
+    assert bars_missed(facts, record, GOES_BY) == {TRAVEL}
+    facts, record = unstopped("identifying")
+    facts.seen["macro_velocity_m_per_s"][1895:] = 0.1
+    assert bars_missed(facts, record, GOES_BY) == {STANDSTILL}
+
+
+def test_a_jog_that_nobody_holds_any_more_is_seen_to_go_on():
+    """0.3 s of hold and 0.17 s that its plan looks ahead, from 0.4 m/s: 297 mm with its way to stop."""
+    facts, record = unstopped("jogging")
+    facts.said_t_ns = 400_000_000
+    assert bars_missed(facts, record, GOES_BY) == {TRAVEL}
+
+
+def test_a_stop_that_the_operator_asked_for_is_one_without_a_fault_too():
+    """Half of the drive's ramp, by the law, and its power is taken at rest; 25 ms until it begins."""
+    for asked_s, missed in ((1.04, set()), (1.0, {TRAVEL})):
+        facts, record = unstopped("stopping")
+        t_s = facts.seen["t_ns"] * 1e-9
+        speed = (0.4 - 1.0 * (t_s - 1.05).clip(min=0.0)).clip(min=0.0)
+        facts.seen["macro_velocity_m_per_s"], facts.seen["macro_position_m"] = speed, np.cumsum(speed) * 1e-3
+        facts.seen["states"][speed < 5e-4] = 1
+        facts.stop_asked_t_ns = round(1e9 * asked_s)
+        assert bars_missed(facts, record, GOES_BY) == missed
+        facts.seen["states"][1300:] = 1  # let go of at 0.15 m/s
+        assert STANDSTILL in bars_missed(facts, record, GOES_BY)
+
+
+def test_until_a_fault_is_noticed_that_need_not_be_the_motion_is_the_one_that_was_asked_for():
+    facts, record = rest_after(2.0, noticed_s=0.2)
+    facts.planned_m_per_s = 0.4
+    may = replace(FAULT, detection_s=float("inf"), must_stop=False)
+    assert bars_missed(facts, record, may) == set()
+    facts.seen["end_position_m"][1050:1150] += 2e-3
+    assert bars_missed(facts, record, may) == {TRAVEL}
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_an_acknowledgement_that_gives_power_or_moves_the_stage_is_seen(axis):
+    facts, record = rest_after(2.0)
+    facts.unasked = [(1_900_000_000, 1_990_000_000)]
+    assert bars_missed(facts, record) == set()
+    facts.seen["states"][1950:, axis] = ENABLED
+    assert bars_missed(facts, record) == {STANDSTILL}
+    facts, record = rest_after(2.0)
+    facts.unasked = [(1_900_000_000, 1_990_000_000)]
+    facts.seen["macro_position_m"][1950:] += 30e-6
+    assert bars_missed(facts, record) == {STANDSTILL}
+
+
+def test_a_jog_whose_operator_has_vanished_is_judged_by_its_own_hold_and_not_by_the_lease():
+    facts, record = unstopped("jogging")
+    t_s = facts.seen["t_ns"] * 1e-9
+    gone = Drawn("client vanishes", detection_s=0.8, silent=True)
+    for ends_s, missed in ((1.4, set()), (1.6, {TRAVEL})):
+        speed = (0.2 - 0.9 * (t_s - ends_s).clip(min=0.0)).clip(min=0.0)
+        facts.seen["macro_velocity_m_per_s"], facts.seen["macro_position_m"] = speed, np.cumsum(speed) * 1e-3
+        facts.seen["states"][1800:] = _STOPPED
+        record.columns["run_phase"][1800:], record.columns["stop"][1800:] = 6, 18
+        left = replace(facts, fault_kind="LEASE", planned_m_per_s=0.2)
+        assert bars_missed(left, record, gone) == missed
+
+
+def test_a_fault_that_never_struck_shows_nothing():
+    facts, record = unstopped("at rest")
+    facts.struck = False
+    assert bars_missed(facts, record, GOES_BY) == {COURSE}
+
+
+def test_the_seeded_part_has_those_that_must_stop_of_kinds_that_may_go_by():
+    drawn = [campaign.drawn(seed) for seed in range(RUNS)]
+    either = ("encoder glitch", "interferometer silent", "host overrun", "supervisor hangs")
+    assert {kind for kind, _, fault, _ in drawn if kind in either and fault.must_stop} == set(either)
+    assert {phase for kind, phase, *_ in drawn if kind == "obstacle (following error)"} >= {"constant speed"}
+    assert "jogging" in {phase for kind, phase, *_ in drawn if kind == "client vanishes"}
+    many = [campaign.drawn(seed) for seed in range(900)]
+    for one in either:
+        musts = [fault.must_stop for kind, _, fault, _ in many if kind == one]
+        assert 0.25 < sum(musts) / len(musts) < 0.75
+    phases = [phase for kind, phase, *_ in many if kind == "obstacle (following error)"]
+    assert set(phases) == set(PHASES)
+    vanished = [phase for kind, phase, *_ in many if kind == "client vanishes"]
+    assert sum(phase == "jogging" for phase in vanished) >= 0.5 * len(vanished)
+
+
+def test_a_drive_goes_with_its_own_encoder_and_no_further():
+    lies = replace(FAULT, encoder_m=1e-3)
+    for off_m, missed in ((1.1e-3, set()), (1.5e-3, {STANDSTILL})):
+        facts, record = rest_after(2.0)
+        facts.seen["macro_position_m"][1600:] += off_m
+        assert bars_missed(facts, record) == {STANDSTILL}
+        assert bars_missed(facts, record, lies) == missed

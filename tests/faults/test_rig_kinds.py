@@ -70,12 +70,20 @@ def test_a_mapping_that_another_tool_writes_takes_effect(rig):
 
 def test_an_encoder_jumps_and_comes_back(rig):
     inject(rig, kind="encoder_jump", node_id=MACRO, offset_m=1e-3, duration_s=0.01)
-    servo = rig.nodes[0].drive.servo
+    drive, servo = rig.nodes[0].drive, rig.nodes[0].drive.servo
     before = int(servo["encoder_count"][0])
+
+    def said() -> int:
+        drive.sample(rig.plant_state()["macro_position_m"], 0.0)
+        return drive.objects[key(0x6064)]
+
+    said_before = said()
     rig.advance(rig.t_ns + 5 * MS)
     assert int(servo["encoder_count"][0]) == pytest.approx(before + 10_000, abs=500)
+    assert said() == pytest.approx(said_before + 10_000, abs=500)
     rig.advance(rig.t_ns + 20 * MS)
     assert int(servo["encoder_count"][0]) == pytest.approx(before, abs=500)
+    assert said() == pytest.approx(said_before, abs=500)
 
 
 def test_a_clock_drifts_for_a_while(rig):
