@@ -109,8 +109,8 @@ class StageWorld(StageState):
         """Return the world, what was asked for, and by whom: a client before the restart, else the service's start.
 
         A swap counts for the profile it was made with and for as long as the service is started in the same way. Where
-        `auto` once found hardware, hardware that is late at the next start is waited for; so is all of it where a half was
-        there and is gone: a USB adapter that is counted anew makes no rig of a machine. LinkError where there is a half.
+        `auto` once found hardware, hardware that is late at the next start is waited for; so is all of it where a half
+        was there and is gone: a USB adapter counted anew makes no rig of a machine. LinkError where there is a half.
         """
         asked, kept = self._backend_asked, self._memory.now
         if kept.profile == str(profile.source_path):
