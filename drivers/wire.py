@@ -133,6 +133,10 @@ class WireDecoder:
         self.cycle = -1
         self.reference_lost = 0
         self.reference_text = ""  # why it was lost, for people
+        self.encoder_text = ""  # what shows that the drive's encoder lies, and not the laser; empty while nothing does
+        self._laser_step_m = self._compared_encoder_m = math.nan
+        self._encoder_jumped = False
+        self._position_mode = profile.macro.mode == "position"
         self.encoder_trusted = False  # only after a homing do laser and encoder share a zero
         self.samples_lost = 0
         self._taken_bytes_count = 0  # of the present inbox
@@ -380,8 +384,10 @@ class WireDecoder:
                 break
 
     def _compare_with_encoder(self, seen: Any, sync_t_ns: int) -> None:
-        """Latch *reference lost* where laser and drive disagree for several cycles, both at the last SYNC's instant.
+        """Notice where laser and drive disagree for several cycles, both at the last SYNC's instant.
 
+        It is told as `encoder_text` where the encoder jumped while the laser went on as before, and the drive does not
+        position by it: then the lasers are what a stop can go by. Else it latches *reference lost*.
         The drive sampled its encoder between the last two laser samples: at 0.2 m/s that is 90 um away. How long the
         host held the SYNC up is not known to better than a period, so one period's way is allowed besides: an offset
         stays when the stage stands, and is found then.
@@ -391,18 +397,27 @@ class WireDecoder:
             since_ns = seen.sample_t_ns - sync_t_ns
             laser_m = macro_m - (macro_m - self._compared_m) * (since_ns / self.period_ns)
             allowed_m = self._disagreement_m + abs(macro_m - self._compared_m)
+            step_m = macro_m - self._compared_m
             if abs(laser_m - seen.macro_encoder_m) <= allowed_m:
                 self._disagreements = 0
             else:
+                if self._disagreements == 0:
+                    laser_bends_m = abs(step_m - self._laser_step_m)
+                    encoder_bends_m = abs(seen.macro_encoder_m - self._compared_encoder_m - self._laser_step_m)
+                    bends_more = encoder_bends_m > laser_bends_m + 0.5 * self._disagreement_m
+                    self._encoder_jumped = bends_more and not self._position_mode
                 self._disagreements += 1
-                if self._disagreements >= _DISAGREEMENTS_IN_A_ROW:
+                if self._disagreements >= _DISAGREEMENTS_IN_A_ROW and not self.encoder_text:
                     away_um = abs(laser_m - seen.macro_encoder_m) * 1e6
-                    self._lose_reference(
-                        f"macro laser and the drive's encoder differ by {away_um:.0f} um, "
-                        f"limit {allowed_m * 1e6:.0f} um"
-                    )
+                    text = f"differ by {away_um:.0f} um, limit {allowed_m * 1e6:.0f} um"
+                    if self._encoder_jumped:
+                        self.encoder_text = f"macro laser and the drive's encoder, which jumped, {text}"
+                    else:
+                        self._lose_reference(f"macro laser and the drive's encoder {text}")
+            self._laser_step_m = step_m
         self._compared_sequence = self.sequence
         self._compared_m = macro_m
+        self._compared_encoder_m = seen.macro_encoder_m
 
     def set_zeros(self, macro_zero_counts: float, end_zero_counts: float) -> tuple[float, float]:
         """Take new laser zeros (a homing); returns by how much all macro and end positions moved, in m."""
@@ -411,8 +426,9 @@ class WireDecoder:
         self.macro_zero_counts = macro_zero_counts
         self.end_zero_counts = end_zero_counts
         self.reference_lost = 0
-        self.reference_text = ""
+        self.reference_text = self.encoder_text = ""
         self.encoder_trusted = True
+        self._laser_step_m = self._compared_encoder_m = math.nan
         self._macro_moved = self._end_moved = (math.nan, math.nan)
         self._macro_moved_sequence = self._end_moved_sequence = math.inf
         self._compared_sequence = -2

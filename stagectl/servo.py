@@ -399,6 +399,8 @@ class Servo:
             return Stop.DIGITAL_INPUT, self._detail(Stop.DIGITAL_INPUT)
         if mode is Mode.TRACK and seen.reference_lost != 0:
             return Stop.REFERENCE_LOST, self.decoder.reference_text
+        if mode is Mode.TRACK and self.decoder.encoder_text:
+            return Stop.ENCODER_LOST, self.decoder.encoder_text
         if seen.lease_left_ns <= 0:
             return Stop.LEASE, "there was none when the drives were to get power; renew it as long as the stage moves"
         return Stop.NONE, ""
@@ -408,7 +410,14 @@ class Servo:
         off, on = cia402.State.SWITCH_ON_DISABLED, cia402.State.OPERATION_ENABLED
         seen = self._seen
         silent = t_ns - self._counter_t_ns > self._silence_ns
-        if self.phase is _TRACKING and self._asked.mode == _TRACK and seen.lease_left_ns > 0 and not silent:
+        lies = self.decoder.encoder_text
+        if (
+            self.phase is _TRACKING
+            and self._asked.mode == _TRACK
+            and seen.lease_left_ns > 0
+            and not silent
+            and not lies
+        ):
             return on, on  # as in almost every cycle
         mode = Mode(self._asked.mode)
         in_phase_s = (t_ns - self._phase_since_t_ns) * 1e-9
@@ -455,6 +464,8 @@ class Servo:
                 silence_s = (t_ns - self._counter_t_ns) * 1e-9
                 text = f"no sign of life for {silence_s:.3f} s, limit {self._silence_ns * 1e-9:g} s"
                 self._end(Stop.SUPERVISOR_SILENT, Phase.STOPPING, t_ns, text)
+            elif lies:  # the law goes by the lasers; the drive would ramp down on what lies, which threw it forward
+                self._end(Stop.ENCODER_LOST, Phase.STOPPING, t_ns, lies)
             elif mode is not Mode.TRACK:
                 self._end(self._asked_stop(), Phase.STOPPING, t_ns)
             elif seen.lease_left_ns <= 0:
@@ -501,8 +512,8 @@ class Servo:
         self._seen.store()
 
     def _stopped_targets(self, mode: Mode) -> tuple[cia402.State, cia402.State]:
-        """Return the drive states of a stage at rest: without power where that was asked for, else held."""
-        if mode in (Mode.EXIT, Mode.RELEASE) or self.stop in _UNPOWERED_STOPS:
+        """Return the drive states of a stage at rest: held, but for power that nobody wants or an encoder that lies."""
+        if mode in (Mode.EXIT, Mode.RELEASE) or self.stop in _UNPOWERED_STOPS or self.stop is Stop.ENCODER_LOST:
             return cia402.State.SWITCH_ON_DISABLED, cia402.State.SWITCH_ON_DISABLED
         return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE
 
@@ -732,6 +743,8 @@ class Servo:
             decoder.samples_lost, decoder.framer.counters.bytes_discarded, decoder.macro_counts, decoder.end_counts,
             decoder.air_index,
         )  # fmt: skip
+        if self.decoder.encoder_text:  # only a homing makes encoder and lasers agree again
+            self._status["reference_lost"] = 1
         if self.text != self._stated_text:
             self._stated_text = self.text
             encoded = self.text.encode()[:TEXT_BYTES_COUNT].ljust(TEXT_BYTES_COUNT, b"\0")

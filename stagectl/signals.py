@@ -105,6 +105,7 @@ class Stop(IntEnum):
     SAMPLE_AHEAD = 24
     STARVED = 25
     HOMING_GIVEN_UP = 26
+    ENCODER_LOST = 27
 
 
 STOP_TEXT = {
@@ -135,6 +136,7 @@ STOP_TEXT = {
     Stop.SAMPLE_AHEAD: "the newest interferometer sample lies in the future",
     Stop.STARVED: "the set-points did not come in time: the stage braked to rest and holds",
     Stop.HOMING_GIVEN_UP: "the macro's drive gave its homing up",
+    Stop.ENCODER_LOST: "the encoder of the macro's drive lies",
 }
 
 

@@ -25,7 +25,7 @@ from stagectl.signals import SETPOINT, STOP_TEXT, Stop
 from stagectl.supervisor import Supervisor
 from tests.small_disk import small_disk
 from tests.stage import with_values
-from tests.struck_stage import REST_M_PER_S, SEED, Stage, Strike, home_by_truth, inject, struck
+from tests.struck_stage import REST_M_PER_S, SEED, SPEED_M_PER_S, Stage, Strike, home_by_truth, inject, struck
 
 MACRO, MICRO = 1, 2  # node ids
 MACRO_TPDO, MICRO_TPDO, MICRO_RPDO, SYNC = 0x181, 0x182, 0x202, 0x080
@@ -393,6 +393,42 @@ def test_a_lost_reference_needs_a_homing(tmp_path, oled_profile, oled_machine):
     refused = run.rows[powered_before : powered_before + 40]
     assert not np.isin(refused["run_phase"], (Phase.ENABLING, Phase.TRACKING)).any()
     assert replay(tmp_path / "run").exact
+
+
+@pytest.mark.parametrize("offset_m", [-4.5e-3, 4.5e-3])
+def test_a_stage_whose_encoder_lies_stops_by_its_lasers(offset_m, tmp_path, oled_profile, oled_machine):
+    """The drive's own stop ramps down on that encoder: it took a macro of 0.4 m/s to 0.7 and 55 mm too far."""
+    jump = Fault("encoder_jump", node_id=MACRO, offset_m=offset_m, duration_s=0.06)
+    one = struck(tmp_path / "run", oled_profile, oled_machine, inject(jump))
+    assert one.outcome.stop is Stop.ENCODER_LOST
+    assert "which jumped, differ by 4" in one.outcome.detail
+    rows, after = one.run.rows, one.truth["t_ns"] >= one.struck_t_ns
+    assert set(rows["run_phase"][rows["stop"] > 0]) <= {Phase.STOPPING}
+    speed = np.abs(one.truth["macro_velocity_m_per_s"][after])
+    assert speed.max() < 1.01 * SPEED_M_PER_S
+    ramp_m = SPEED_M_PER_S**2 / (2.0 * oled_profile.macro.stop_deceleration_m_per_s2)
+    way_m = np.abs(one.truth["macro_position_m"][after] - one.truth["macro_position_m"][after][0]).max()
+    assert way_m < SPEED_M_PER_S * 0.008 + ramp_m + 1e-4
+    at_rest_t_ns = rows["t_ns"][np.flatnonzero(rows["run_phase"] == Phase.STOPPED)[0]]
+    assert np.interp(at_rest_t_ns, one.truth["t_ns"][after], speed) < REST_M_PER_S
+    assert one.drive_states == ("SWITCH_ON_DISABLED", "SWITCH_ON_DISABLED")  # none that holds by it
+    assert one.replays() == ""
+
+
+def test_an_encoder_that_lied_needs_a_homing(tmp_path, oled_profile, oled_machine):
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        one.arm()
+        jump = Fault("encoder_jump", node_id=MACRO, offset_m=3e-3, duration_s=0.05)
+        assert one.move(inject(jump)).stop is Stop.ENCODER_LOST
+        assert one.stage.acknowledge() is Stop.NONE
+        assert one.stage.status()["reference_lost"]
+        assert one.stage.enable() is Stop.ENCODER_LOST
+        assert "the drive's encoder, which jumped, differ by 3" in one.stage.detail
+        one.stage.acknowledge()
+        assert one.stage.home().finished
+        assert one.arm() is Stop.NONE
+        assert one.move().finished
 
 
 def test_a_drive_in_fault_is_reset_by_an_acknowledgement_and_by_nothing_else(tmp_path, oled_profile, oled_machine):

@@ -121,6 +121,22 @@ def test_a_sample_of_the_future_says_how_far_and_what_to_check(oled_profile):
     assert "newest sample 1000 is 3.500 ms ahead of its cycle, limit 1 ms; check interferometer.rate_hz" in said
 
 
+def test_lines_that_are_late_for_good_end_the_run(oled_profile):
+    """Each is younger than the limit of age, so a reference that is left behind was never looked at."""
+    one = Cycle(oled_profile)
+    late = {"samples_new": 1, "end_position_m": 0.1e-3}
+    for k in range(100):
+        assert one.set(**late, cycle=1001 + k, sequence=1000 + k).stop() is Stop.NONE
+    assert one.set(**late, cycle=1101, sequence=1101).stop() is Stop.NONE  # one in time, and the count begins anew
+    for k in range(100):
+        assert one.set(**late, cycle=1102 + k, sequence=1101 + k).stop() is Stop.NONE
+    assert one.set(**late, cycle=1202, sequence=1201).stop() is Stop.SENSOR_AGE
+    said = stop_detail(
+        Stop.SENSOR_AGE, one.measurement[0], one.setpoint[0], np.zeros(1, COMMAND)[0], one.guard[0], {}, "dsmc"
+    )
+    assert "each of the last 101 cycles had to do without its own sample, limit 100" in said
+
+
 def test_how_far_ahead_a_sample_may_lie_is_the_profiles_period(oled_profile):
     slow = with_values(oled_profile, cycle__rate_hz=500.0)
     assert Cycle(slow).set(sample_t_ns=10**12 + 5 * MS // 2).stop() is Stop.NONE

@@ -28,6 +28,7 @@ _REMEDY = {
     Stop.HEARTBEAT_LOST: "check the drive's power and firmware, then acknowledge",
     Stop.RECORD_LOST: "free space on the disk of the runs, then acknowledge",
     Stop.HOMING_GIVEN_UP: "check index, limit switches and macro.homing, acknowledge, then home",
+    Stop.ENCODER_LOST: "check the encoder, its cable and the drive, acknowledge, then home",
     Stop.SAMPLE_AHEAD: "check interferometer.rate_hz and the host's clock, then acknowledge",
 }
 

@@ -279,7 +279,9 @@ def sequence_gap(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def sensor_restart(rng: np.random.Generator, phase: str) -> Drawn:
-    return Drawn("interferometer restarted", (Fault("sensor_restart"),), detection_s=AT_ONCE_S)
+    """Before a homing has taken its zeros nothing counts from where the device began."""
+    must = phase != "homing"
+    return Drawn("interferometer restarted", (Fault("sensor_restart"),), must_stop=must, detection_s=AT_ONCE_S)
 
 
 def counts_stuck(rng: np.random.Generator, phase: str) -> Drawn:
