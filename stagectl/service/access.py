@@ -106,8 +106,8 @@ async def let_in(application: Application, role: Role, scope: Scope, receive: Re
     if length and (not length.isdigit() or int(length) > most):
         await refuse(scope, send, 413, f"Content-Length {length[:20]}: the limit is {most} bytes")
         return
-    if scope["type"] == "http" and not length and header(scope, b"transfer-encoding"):
-        await refuse(scope, send, 411, "send a Content-Length; bodies in pieces are not taken")
+    if header(scope, b"transfer-encoding"):  # beside it a Content-Length says nothing: the pieces have no end
+        await refuse(scope, send, 411, "send a Content-Length and no Transfer-Encoding; bodies in pieces are not taken")
         return
     await application(scope, receive, send)
 

@@ -12,7 +12,7 @@ import pytest
 from stagectl.client import Client
 from stagectl.errors import LinkError, ProfileError, RecordError, RequestError
 from stagectl.service import messages
-from stagectl.service.access import Access, Role, read_tokens, role_of
+from stagectl.service.access import BODY_LIMIT_BYTES, Access, Role, read_tokens, role_of
 from stagectl.service.admission import CONNECTIONS_LIMIT, RESERVE_COUNT
 from stagectl.service.api import application
 from stagectl.service.desk import Desk
@@ -140,6 +140,38 @@ def test_the_state_survives_and_a_damaged_one_is_said(tmp_path):
     assert sorted(os.listdir(tmp_path / "deep")) == [FILE]
     with pytest.raises(RecordError, match="can't be kept"):
         keep(path, remembered)
+
+
+@pytest.mark.parametrize("length", [b"", b"Content-Length: 5\r\n"], ids=["in pieces", "in pieces, with a length"])
+def test_no_body_in_pieces_gets_as_far_as_the_application(tmp_path, length):
+    taken_bytes = []
+
+    async def reading(scope, receive, send):
+        more = True
+        while more:
+            said = await receive()
+            taken_bytes.append(len(said.get("body", b"")))
+            more = said.get("more_body", False)
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"0")]})
+        await send({"type": "http.response.body", "body": b""})
+
+    tokens = read_tokens(tmp_path / "tokens")
+    listener = Listener([(listen_unix(tmp_path / "s"), Access(reading, tokens))])
+    listener.start()
+    piece = b"%x\r\n%s\r\n" % (BODY_LIMIT_BYTES, b"x" * BODY_LIMIT_BYTES)
+    try:
+        with socket.socket(socket.AF_UNIX) as one:
+            one.settimeout(10.0)
+            one.connect(str(tmp_path / "s"))
+            one.sendall(b"PUT /v1/lease HTTP/1.1\r\nHost: s\r\nTransfer-Encoding: chunked\r\n" + length)
+            one.sendall(b"Authorization: Bearer %s\r\n\r\n" % tokens[Role.OBSERVE].encode())
+            for _ in range(16):
+                one.sendall(piece)
+            one.sendall(b"0\r\n\r\n")
+            assert one.recv(12) == b"HTTP/1.1 411"
+    finally:
+        listener.close()
+    assert sum(taken_bytes) == 0
 
 
 class Crowd:
