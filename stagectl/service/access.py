@@ -23,6 +23,7 @@ BODY_LIMIT_BYTES = 64 * 1024
 TABLE_LIMIT_BYTES = 2 * 1024 * 1024
 """For a motion's table, on its own path."""
 
+LEASE_HEADER = b"stagectl-lease"
 _TABLE_PATH = "/v1/follow"
 _TOKEN_BYTES = 24
 _LEAST_TOKEN_LETTERS = 20
