@@ -245,8 +245,9 @@ class Desk:
     def is_lease_token(self, token: str) -> bool:
         """Tell whether a client gave the token of the lease that lasts; compares in a time that says nothing."""
         lease = self._lease
-        known = lease is not None and lease.left_s(self._clock_s()) > 0.0
-        return known and hmac.compare_digest(lease.token.encode(), token.encode(errors="replace"))
+        if lease is None or not lease.left_s(self._clock_s()) > 0.0:
+            return False
+        return hmac.compare_digest(lease.token.encode(), token.encode(errors="replace"))
 
     def take_lease(self, body: messages.TakeLease, key: str = "") -> messages.TakenLease:
         """Give the lease to a client; with the same key again, the same one. Errors: LeaseRefused, RequestError."""

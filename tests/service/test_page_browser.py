@@ -12,6 +12,7 @@ import time
 
 import pytest
 
+from stagectl.requests import TICKING, Phase
 from stagectl.service.access import Role
 from tests.service.daemon import Daemon, at_rest
 from tests.service.pages import PageServer
@@ -332,7 +333,8 @@ def rows_of(setpoints=(), errors=(), contacts=()):
     count = max(len(setpoints), len(errors), len(contacts))
     column = lambda values: list(values) or [0.0] * count  # noqa: E731
     triples = zip(column(setpoints), column(errors), column(contacts), strict=True)
-    return [[0.01 * i, 0.0, 0.0, s, e, 0.0, 0.0, 0.0, c, 0] for i, (s, e, c) in enumerate(triples)]
+    tracking = int(Phase.TRACKING)
+    return [[0.01 * i, 0.0, 0.0, s, e, 0.0, 0.0, 0.0, c, tracking] for i, (s, e, c) in enumerate(triples)]
 
 
 READOUT = """async ([rows, a, b]) => {
@@ -403,9 +405,24 @@ def test_a_trigger_fires_at_the_first_rise_contact_or_reversal(opened):
     assert first(errors, "error", 5e-6, begin=3) == 5
     assert first(errors, "error", 8e-6) == -1
     assert first(rows_of(errors=[None, 9e-6, 9e-6]), "error", 5e-6) == -1  # no rise was seen
+    late = rows_of(errors=[0.0, None, 9e-6, None, 9e-6, 0.0, None])
+    assert first(late, "error", 5e-6) == 2  # across a late line
+    assert first(late, "error", 5e-6, begin=2) == 2
+    assert first(late, "error", 5e-6, begin=3) == -1  # across another it goes on
     assert first(rows_of(contacts=[0.2, -0.9, -1.0, 2.0]), "contact", 1.0) == 2
     there_and_back = rows_of(setpoints=[0.0, 1e-3, 2e-3, 2e-3, 2e-3, 1e-3, 0.0])
     assert first(there_and_back, "reversal") == 5  # over the rest between
     assert first(rows_of(setpoints=[0.0, 0.0, 1e-3, 2e-3]), "reversal") == -1  # a beginning is no reversal
     assert first(rows_of(setpoints=[1e-3, 2e-3, None, 2e-3, 1e-3]), "reversal") == -1
     assert first(there_and_back, "none") == -1
+    for phase in Phase:
+        swings = rows_of(errors=[0.0, 9e-6], contacts=[0.0, 2.0])
+        turns = rows_of(setpoints=[0.0, 1e-3, 0.0])
+        for row in swings + turns:
+            row[-1] = int(phase)
+        fires = phase in TICKING  # without power nothing is followed
+        assert first(swings, "error", 5e-6) == first(swings, "contact", 1.0) == (1 if fires else -1), phase
+        assert first(turns, "reversal") == (2 if fires else -1), phase
+    begins = rows_of(errors=[9e-6, 9e-6, 9e-6])
+    begins[0][-1] = int(Phase.IDLE)
+    assert first(begins, "error", 5e-6) == 1  # armed away from its set-point
