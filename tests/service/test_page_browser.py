@@ -394,6 +394,63 @@ def test_a_stop_that_nobody_hears_says_so(idle, opened):
     expect(page.locator("#alarm")).to_be_hidden()  # said again, and heard
 
 
+def test_a_page_that_was_not_told_its_role_stops_all_the_same_and_asks_again(idle, opened):
+    page = opened(Role.OPERATE)
+    page.route("**/session", lambda route: route.abort())
+    page.reload()
+    expect(page.locator("#state")).not_to_have_attribute("data-state", "lost", timeout=PATIENCE_MS)
+    with page.expect_response("**/v1/stop") as answered:
+        page.click("#stop")
+    assert answered.value.status == 202
+    page.locator("#take").click(force=True)
+    expect(page.locator("#refusal")).to_contain_text("has not said yet")
+    page.unroute("**/session")
+    page.locator("#take:not([aria-disabled=true])").click()
+    expect(page.locator("#lease")).to_have_text("this page operates", timeout=PATIENCE_MS)
+    page.click("#take")
+
+
+def test_an_observer_s_escape_key_says_that_it_stops_nothing(idle, opened):
+    page = opened(Role.OBSERVE)
+    expect(page.locator("#stop")).to_be_disabled()
+    page.keyboard.press("Escape")
+    expect(page.locator("#alarm")).to_contain_text("STOP was not sent")
+
+
+def test_a_step_whose_answer_got_lost_is_not_done_twice(idle, opened):
+    page = armed_page(opened)
+    keys = []
+
+    def lose_the_first_answer(route):
+        keys.append(route.request.headers["idempotency-key"])
+        answer = route.fetch()
+        if len(keys) == 1:
+            route.fulfill(status=502, json={"kind": "LinkError", "message": "no answer from the service."})
+        else:
+            route.fulfill(response=answer)
+
+    page.route("**/v1/jog", lose_the_first_answer)
+    before_m = idle.client.status().positions.end_position_m
+    step, way_m = ("#step-left", -1e-3) if before_m > 0.01 else ("#step-right", 1e-3)
+    page.fill("#distance", "1")
+    page.select_option("#distance-unit", label="mm")
+    page.click(step)
+    expect(page.locator("#refusal")).to_contain_text("pressed again, it is not done twice")
+    expect(page.locator("#command-text")).to_have_text("jog: done", timeout=PATIENCE_MS)
+    state_is(page, "armed")
+    with page.expect_response("**/v1/jog"):
+        page.click(step)
+    expect(page.locator("#refusal")).to_be_hidden()
+    state_is(page, "armed")
+    assert idle.client.status().positions.end_position_m == pytest.approx(before_m + way_m, abs=1e-4)
+    with page.expect_response("**/v1/jog"):
+        page.click(step)
+    idle.until(lambda: abs(idle.client.status().positions.end_position_m - before_m) > 1.5e-3, "the second step")
+    assert keys[0] == keys[1] != keys[2]
+    page.click("#stop")
+    state_is(page, "idle")
+
+
 def test_a_trigger_fires_at_the_first_rise_contact_or_reversal(opened):
     page = opened(Role.OBSERVE)
 
