@@ -1,5 +1,6 @@
 """The page in a real Chromium: what an operator does, what an observer can't, and a page that vanishes mid-jog."""
 
+import csv
 import functools
 import http.server
 import json
@@ -247,6 +248,48 @@ def test_hold_and_zoom_keep_the_picture_and_let_it_go(idle, opened):
     expect(page.locator("#level")).to_be_visible()
     page.fill("#level", "1e9")
     page.locator("#level").blur()
+    expect(chip).to_have_text("waits for the trigger")
+
+
+def saved_samples(page):
+    """Return what the scope shows, one dictionary a sample; a value that isn't known is empty."""
+    with page.expect_download() as saved:
+        page.click("#save")
+    with open(saved.value.path()) as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_trigger_holds_the_picture_around_the_event(idle, opened):
+    page = armed_page(opened)
+
+    def move(target_mm):
+        page.fill("#target", f"{target_mm}")
+        with page.expect_response("**/v1/move"):
+            page.click("#move")
+        expect(page.locator("#command-text")).to_have_text("move: done", timeout=PATIENCE_MS)
+        state_is(page, "armed")
+
+    move(20)
+    move(10)
+    page.select_option("#window", "1")
+    page.select_option("#trigger", "reversal")
+    page.check("#single")
+    chip = page.locator("#trigger-state")
+    expect(chip).to_have_text("waits for the trigger")
+    move(20)
+    expect(chip).to_have_text("triggered", timeout=PATIENCE_MS)
+    expect(page.locator("#hold")).to_have_text("Next")
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")  # drawn
+    shot = saved_samples(page)
+    times_s = [float(one["t_s"]) for one in shot]
+    setpoints_m = [float(one["setpoint_position_m"]) for one in shot]
+    turn = next(at for at in range(1, len(shot)) if setpoints_m[at] - setpoints_m[at - 1] > 1e-8)
+    assert times_s[-1] - times_s[0] == pytest.approx(1.0, abs=0.03)
+    assert times_s[turn] - times_s[0] == pytest.approx(0.25, abs=0.03)
+    page.click("#stop")
+    state_is(page, "idle")
+    assert saved_samples(page) == shot  # whatever comes
+    page.click("#hold")
     expect(chip).to_have_text("waits for the trigger")
 
 
