@@ -1,4 +1,4 @@
-"""What is installed is what is here: every package is listed, and the page's assets go along."""
+"""What is installed is what is here: every package is listed, and the page's assets and the mark of types go along."""
 
 import tomllib
 from pathlib import Path
@@ -16,4 +16,5 @@ def test_every_package_is_installed():
     assert set(listed["packages"]) == here
     for package, patterns in listed["package-data"].items():
         folder = ROOT.joinpath(*package.split("."))
-        assert all(any(one.is_file() for one in folder.glob(f"{pattern}/*")) for pattern in patterns)
+        assert all(any(one.is_file() for one in folder.glob(pattern.replace("**", "**/*"))) for pattern in patterns)
+    assert "py.typed" in listed["package-data"]["stagectl"]  # else nobody's type checker sees the client's types

@@ -36,7 +36,8 @@ def page(voice: Voice, socket: Path | None, port: int, runs_root: Path, as_json:
     sessions = Sessions(show)
     with tempfile.TemporaryDirectory(prefix="stagectl-page-") as drawn:
         served = application(path, Reports(runs_root, Path(drawn)))
-        listener = Listener([(listening, Admission(served, sessions, listening.getsockname()[1]))], lifespan="on")
+        admission = Admission(served, sessions, listening.getsockname()[1])
+        listener = Listener([(listening, admission)], lifespan="on", from_operator=admission.is_from_operator)
         listener.start()
         try:
             for role in _ROLES:

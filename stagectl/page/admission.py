@@ -136,6 +136,13 @@ class Admission:
         else:
             await let_in(self._application, session.role, scope, receive, send)
 
+    def is_from_operator(self, scope: Scope) -> bool:
+        """Tell whether a request is from an operator's own page: it has cookie and key."""
+        session = self._sessions.session(self._cookie_of(scope))
+        if session is None or session.role is not Role.OPERATE or self._stranger(scope):
+            return False
+        return _same(session.key, header(scope, KEY_HEADER.encode()))
+
     def _stranger(self, scope: Scope) -> str:
         """Say why a request is not from our own page at our own address; empty where it is."""
         hosts = _all(scope, b"host")

@@ -23,6 +23,7 @@ BODY_LIMIT_BYTES = 64 * 1024
 TABLE_LIMIT_BYTES = 2 * 1024 * 1024
 """For a motion's table, on its own path."""
 
+LEASE_HEADER = b"stagectl-lease"
 _TABLE_PATH = "/v1/follow"
 _TOKEN_BYTES = 24
 _LEAST_TOKEN_LETTERS = 20
@@ -106,8 +107,8 @@ async def let_in(application: Application, role: Role, scope: Scope, receive: Re
     if length and (not length.isdigit() or int(length) > most):
         await refuse(scope, send, 413, f"Content-Length {length[:20]}: the limit is {most} bytes")
         return
-    if scope["type"] == "http" and not length and header(scope, b"transfer-encoding"):
-        await refuse(scope, send, 411, "send a Content-Length; bodies in pieces are not taken")
+    if header(scope, b"transfer-encoding"):  # beside it a Content-Length says nothing: the pieces have no end
+        await refuse(scope, send, 411, "send a Content-Length and no Transfer-Encoding; bodies in pieces are not taken")
         return
     await application(scope, receive, send)
 

@@ -1,7 +1,8 @@
-"""How many clients there may be, and why none of them keeps a stop out.
+"""How many clients there may be, and why none of them keeps a stop out, or the operator.
 
-Beyond the limit everything but a stop is refused, and of the connections that ask nothing the oldest make room: so
-there is always one left for whoever wants to stop the stage. uvicorn's own limit refuses whatever comes, a stop too.
+Beyond the limit everything is refused but a stop and what the operator asks, and of the connections that ask nothing
+the oldest make room, the operator's last: so there is always one left for whoever wants to stop the stage, and a lease
+is renewed whoever else is there. uvicorn's own limit refuses whatever comes, a stop too.
 """
 
 import json
@@ -13,14 +14,18 @@ from stagectl.service.access import Application, Receive, Scope, Send
 
 CONNECTIONS_LIMIT = 100
 RESERVE_COUNT = 50
-"""Beyond the limit, for stops."""
+"""Beyond the limit, for stops and for the operator."""
 
 _STOP_PATH = "/v1/stop"
+_FROM_OPERATOR = "stagectl_from_operator"
 _TEXT = f"{CONNECTIONS_LIMIT} connections are open, the limit; close some and try again. A stop is taken always."
 
 
 class Connection(H11Protocol):
-    """A client's connection; when too many are open, the one that has asked nothing for longest is closed."""
+    """A client's connection; when too many are open, the one that has asked nothing for longest is closed.
+
+    The operator's are closed last: a renewal that finds its connection closed may be the one that comes too late.
+    """
 
     def connection_made(self, transport) -> None:
         """Take the connection, and make room for the next."""
@@ -30,7 +35,12 @@ class Connection(H11Protocol):
             others = [one for one in self.connections if isinstance(one, Connection) and one is not self]
             silent = [one for one in others if one.is_silent]
             if silent:
-                min(silent, key=lambda one: one.begun_s).transport.close()
+                min(silent, key=lambda one: (one.is_the_operators, one.begun_s)).transport.close()
+
+    @property
+    def is_the_operators(self) -> bool:
+        """Whether the operator asked last here."""
+        return self.scope is not None and self.scope.get(_FROM_OPERATOR, False)
 
     @property
     def is_silent(self) -> bool:
@@ -39,17 +49,22 @@ class Connection(H11Protocol):
 
 
 class Admission:
-    """Refuses whatever comes over one connection too many, but for a stop."""
+    """Refuses whatever comes over one connection too many, but for a stop and for the operator."""
 
-    def __init__(self, application: Application, connections_count: Callable[[], int]):
-        """`connections_count` says how many are open now."""
+    def __init__(
+        self, application: Application, connections_count: Callable[[], int], from_operator: Callable[[Scope], bool]
+    ):
+        """`connections_count` says how many are open now, `from_operator` whose request nobody else could have sent."""
         self._application, self._connections_count = application, connections_count
+        self._from_operator = from_operator
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass one request on, or refuse it."""
         is_stop = scope["type"] == "http" and scope.get("path") == _STOP_PATH and scope.get("method") == "POST"
         is_client = scope["type"] in ("http", "websocket")
-        if is_stop or not is_client or self._connections_count() <= CONNECTIONS_LIMIT:
+        from_operator = is_client and self._from_operator(scope)
+        scope[_FROM_OPERATOR] = from_operator
+        if is_stop or from_operator or not is_client or self._connections_count() <= CONNECTIONS_LIMIT:
             await self._application(scope, receive, send)
         elif scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1013, "reason": _TEXT[:120]})

@@ -11,7 +11,7 @@ from stagectl.errors import LinkError, RequestError
 from stagectl.left_memory import remove_left_blocks
 from stagectl.left_runs import finish_left_runs
 from stagectl.record import recover_orphans
-from stagectl.service.access import Access, read_tokens
+from stagectl.service.access import LEASE_HEADER, Access, header, read_tokens
 from stagectl.service.api import application
 from stagectl.service.desk import Desk
 from stagectl.service.exposition import Figures
@@ -54,7 +54,11 @@ def serve(settings: Settings, socket_path: Path, tcp_port: int | None) -> None:
         log.say("recovered", str(outcome), run=folder.name)
     loop = StageLoop(settings, desk, log, remembered, notifier, figures)
     hear_signals(loop)
-    listener = Listener(sockets, ended=lambda: os.kill(os.getpid(), signal.SIGTERM))  # heard by the stage's thread
+    listener = Listener(
+        sockets,
+        ended=lambda: os.kill(os.getpid(), signal.SIGTERM),  # heard by the stage's thread
+        from_operator=lambda scope: desk.is_lease_token(header(scope, LEASE_HEADER)),
+    )
     keep_for_good()
     loop.recall_fault()
     loop.show()  # whoever asks first is answered

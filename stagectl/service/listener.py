@@ -8,15 +8,17 @@ from typing import Literal
 
 import uvicorn
 
-from stagectl.service.access import Application
+from stagectl.service.access import Application, Scope
 from stagectl.service.admission import Admission, Connection
 
 _CLOSE_S = 2.0
 _START_S = 10.0
 
 
-def _server(application: Application, lifespan: Literal["on", "off"]) -> uvicorn.Server:
-    admission = Admission(application, lambda: len(server.server_state.connections))
+def _server(
+    application: Application, lifespan: Literal["on", "off"], from_operator: Callable[[Scope], bool]
+) -> uvicorn.Server:
+    admission = Admission(application, lambda: len(server.server_state.connections), from_operator)
     server = uvicorn.Server(
         uvicorn.Config(
             admission,  # pyright: ignore[reportArgumentType]
@@ -41,16 +43,18 @@ class Listener:
         served: Sequence[tuple[socket.socket, Application]],
         lifespan: Literal["on", "off"] = "off",
         ended: Callable[[], None] = lambda: None,
+        from_operator: Callable[[Scope], bool] = lambda scope: False,
     ):
         """Take sockets that listen already; nothing is answered before `start`.
 
         `lifespan` "on": the applications are told of their beginning and end. `ended` is called, from the thread that
-        listens, where it stops answering without having been closed.
+        listens, where it stops answering without having been closed. `from_operator` tells which requests are answered
+        however many clients there are.
         """
         self._ended, self._closing = ended, False
         self.has_failed = False
         self._sockets = [listening for listening, _ in served]
-        self._servers = [_server(application, lifespan) for _, application in served]
+        self._servers = [_server(application, lifespan, from_operator) for _, application in served]
         self._thread = threading.Thread(target=self._work, name="api", daemon=True)
 
     def start(self) -> None:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stagectl.requests import TICKING
+
 SCOPE_HZ = 100.0
 KEPT_COUNT = 3000
 """Half a minute."""
@@ -24,7 +26,8 @@ COLUMNS = (
 )
 """`t_s` is the servo's clock; `error_m` is the greatest of the rows that a sample stands for, with its sign.
 
-Rows whose line came late have no error: position and set-point are of different instants there.
+Rows whose line came late have no error: position and set-point are of different instants there. Nor has what came
+before the power, or behind it, in a sample whose `phase`, its first row's, is the other's.
 """
 
 
@@ -56,6 +59,8 @@ class Scope:
             return
         taken = rows[: whole : self._every]
         fresh = (rows["sequence"] == rows["cycle"]) & (rows["samples_new"] > 0)
+        working = np.isin(rows["run_phase"], TICKING)
+        fresh &= working == np.repeat(working[:: self._every], self._every)[: rows.size]
         errors_m = np.where(fresh, rows["end_position_m"] - rows["setpoint_position_m"], np.nan)[:whole]
         errors_m = errors_m.reshape(-1, self._every)
         worst = np.argmax(np.where(np.isnan(errors_m), -1.0, np.abs(errors_m)), axis=1)

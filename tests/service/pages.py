@@ -26,7 +26,8 @@ class PageServer:
         self.sessions = Sessions()
         self._drawn = tempfile.TemporaryDirectory()
         served = application(socket_path, Reports(runs, Path(self._drawn.name)))
-        self._listener = Listener([(listening, Admission(served, self.sessions, self.port))], lifespan="on")
+        admission = Admission(served, self.sessions, self.port)
+        self._listener = Listener([(listening, admission)], lifespan="on", from_operator=admission.is_from_operator)
         self._listener.start()
 
     def link(self, role: Role) -> str:

@@ -1,8 +1,10 @@
 """The daemon as a real process on the software rig, over its Unix socket: what clients do, and what they can't."""
 
 import asyncio
+import contextlib
 import json
 import signal
+import socket
 import stat
 import time
 from pathlib import Path
@@ -16,6 +18,7 @@ from stagectl.record import read_run
 from stagectl.ring import writer_alive
 from stagectl.service import messages
 from stagectl.service.access import read_tokens
+from stagectl.service.admission import CONNECTIONS_LIMIT
 from tests.service.daemon import REST_M_PER_S, Daemon
 
 # httpcore leaves the socket of a Unix connection that is refused (of a killed service) to the garbage collector.
@@ -148,6 +151,20 @@ def test_tcp_needs_a_token_and_its_role(idle):
                 ask()
     with Client(tcp_port=port, token=tokens["operate"]) as operator:
         operator.take_lease("x")
+        operator.give_lease_back()
+
+
+def test_no_crowd_on_a_port_keeps_the_lease_s_holder_out(idle):
+    tokens = read_tokens(idle.state / "tokens")
+    with Client(tcp_port=idle.tcp_port, token=tokens["operate"]) as operator, contextlib.ExitStack() as crowd:
+        operator.take_lease("x", 30.0)
+        for _ in range(CONNECTIONS_LIMIT + 10):
+            crowd.enter_context(socket.create_connection(("127.0.0.1", idle.tcp_port)))
+        with Client(tcp_port=idle.tcp_port, token=tokens["observe"]) as watcher:
+            with pytest.raises(RequestError, match="connections are open, the limit"):
+                watcher.status()
+            assert idle.client.status().state == "idle"  # the socket's own clients are counted apart
+        operator.renew_lease()
         operator.give_lease_back()
 
 

@@ -6,13 +6,14 @@ import socket
 import stat
 import threading
 import time
+from http.client import HTTPResponse
 
 import pytest
 
 from stagectl.client import Client
 from stagectl.errors import LinkError, ProfileError, RecordError, RequestError
 from stagectl.service import messages
-from stagectl.service.access import Access, Role, read_tokens, role_of
+from stagectl.service.access import BODY_LIMIT_BYTES, LEASE_HEADER, Access, Role, header, read_tokens, role_of
 from stagectl.service.admission import CONNECTIONS_LIMIT, RESERVE_COUNT
 from stagectl.service.api import application
 from stagectl.service.desk import Desk
@@ -142,6 +143,38 @@ def test_the_state_survives_and_a_damaged_one_is_said(tmp_path):
         keep(path, remembered)
 
 
+@pytest.mark.parametrize("length", [b"", b"Content-Length: 5\r\n"], ids=["in pieces", "in pieces, with a length"])
+def test_no_body_in_pieces_gets_as_far_as_the_application(tmp_path, length):
+    taken_bytes = []
+
+    async def reading(scope, receive, send):
+        more = True
+        while more:
+            said = await receive()
+            taken_bytes.append(len(said.get("body", b"")))
+            more = said.get("more_body", False)
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"0")]})
+        await send({"type": "http.response.body", "body": b""})
+
+    tokens = read_tokens(tmp_path / "tokens")
+    listener = Listener([(listen_unix(tmp_path / "s"), Access(reading, tokens))])
+    listener.start()
+    piece = b"%x\r\n%s\r\n" % (BODY_LIMIT_BYTES, b"x" * BODY_LIMIT_BYTES)
+    try:
+        with socket.socket(socket.AF_UNIX) as one:
+            one.settimeout(10.0)
+            one.connect(str(tmp_path / "s"))
+            one.sendall(b"PUT /v1/lease HTTP/1.1\r\nHost: s\r\nTransfer-Encoding: chunked\r\n" + length)
+            one.sendall(b"Authorization: Bearer %s\r\n\r\n" % tokens[Role.OBSERVE].encode())
+            for _ in range(16):
+                one.sendall(piece)
+            one.sendall(b"0\r\n\r\n")
+            assert one.recv(12) == b"HTTP/1.1 411"
+    finally:
+        listener.close()
+    assert sum(taken_bytes) == 0
+
+
 class Crowd:
     """Raw connections to a served API: silent ones, and streams."""
 
@@ -169,7 +202,10 @@ def crowd(tmp_path):
     desk = Desk(log)
     loop = StageLoop(Settings("none", "rig", tmp_path, tmp_path), desk, log, Remembered(), Notifier({}), Figures())
     loop._tick()
-    listener = Listener([(listen_unix(path), Access(application(desk, log, Figures(), tmp_path, "0"), None))])
+    listener = Listener(
+        [(listen_unix(path), Access(application(desk, log, Figures(), tmp_path, "0"), None))],
+        from_operator=lambda scope: desk.is_lease_token(header(scope, LEASE_HEADER)),
+    )
     listener.start()
     made = Crowd(path)
     with Client(path) as client:
@@ -211,6 +247,32 @@ def test_no_crowd_keeps_a_stop_out(crowd, asked):
         except RequestError:
             time.sleep(0.02)
     raise AssertionError("still refused")
+
+
+def renewed(connection, token):
+    """Renew a lease over an open connection, and return the answer's code."""
+    connection.sendall(f"PUT /v1/lease HTTP/1.1\r\nHost: s\r\nStagectl-Lease: {token}\r\n\r\n".encode())
+    answer = HTTPResponse(connection)
+    answer.begin()
+    answer.read()
+    return answer.status
+
+
+def test_no_crowd_keeps_the_operator_s_renewals_out(crowd):
+    many, desk, client = crowd
+    token = client.take_lease("the operator", 30.0).token
+    before = many.connect()
+    for number in range(CONNECTIONS_LIMIT + 3 * RESERVE_COUNT):
+        if number % RESERVE_COUNT == 0:
+            assert renewed(before, token) == 200  # older than all that made room
+        many.connect()
+    with pytest.raises(RequestError, match="connections are open, the limit"), Client(many.path) as other:
+        other.status()
+    assert renewed(before, token) == 200
+    assert renewed(many.connect(), token) == 200
+    assert renewed(many.connect(), "guessed") == 503
+    desk.give_lease_back(token)
+    assert renewed(many.connect(), token) == 503
 
 
 def test_streams_up_to_the_limit_leave_room_for_a_stop(crowd):

@@ -1,8 +1,10 @@
 """The page's door without a browser: links, cookie, Host, Origin, roles; and what it passes on to the service."""
 
 import asyncio
+import contextlib
 import json
 import signal
+import socket
 import subprocess
 import sys
 
@@ -12,6 +14,7 @@ import websockets
 
 from stagectl.page.admission import ENTRY, KEY_HEADER, Sessions
 from stagectl.service.access import Role
+from stagectl.service.admission import CONNECTIONS_LIMIT
 from tests.service.pages import PageServer
 
 pytestmark = pytest.mark.real_time
@@ -122,6 +125,19 @@ def test_an_observer_commands_nothing(page, daemon):
         assert browser.delete("/v1/record").status_code == 403
         assert browser.request("PATCH", "/v1/status").status_code == 403
     assert daemon.client.lease_state() is None
+
+
+def test_no_crowd_keeps_an_operator_s_page_out(page, idle):
+    with page.browser(Role.OPERATE) as browser, page.browser(Role.OBSERVE) as watcher, contextlib.ExitStack() as crowd:
+        for _ in range(CONNECTIONS_LIMIT + 10):
+            crowd.enter_context(socket.create_connection(("127.0.0.1", page.port)))
+        taken = browser.post("/v1/lease", json={"holder": "page test", "duration_s": 10.0})
+        assert taken.status_code == 200
+        headers = {"Stagectl-Lease": taken.json()["token"]}
+        assert browser.put("/v1/lease", headers=headers).status_code == 200
+        assert browser.put("/v1/lease", headers=headers | {KEY_HEADER: "guessed"}).status_code == 503
+        assert watcher.get("/v1/status").status_code == 503
+        assert browser.delete("/v1/lease", headers=headers).status_code == 204
 
 
 def test_an_operator_s_requests_are_passed_on_with_lease_and_key(page, idle):

@@ -1,5 +1,6 @@
 """The page in a real Chromium: what an operator does, what an observer can't, and a page that vanishes mid-jog."""
 
+import csv
 import functools
 import http.server
 import json
@@ -12,6 +13,7 @@ import time
 
 import pytest
 
+from stagectl.requests import TICKING, Phase
 from stagectl.service.access import Role
 from tests.service.daemon import Daemon, at_rest
 from tests.service.pages import PageServer
@@ -249,6 +251,48 @@ def test_hold_and_zoom_keep_the_picture_and_let_it_go(idle, opened):
     expect(chip).to_have_text("waits for the trigger")
 
 
+def saved_samples(page):
+    """Return what the scope shows, one dictionary a sample; a value that isn't known is empty."""
+    with page.expect_download() as saved:
+        page.click("#save")
+    with open(saved.value.path()) as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_trigger_holds_the_picture_around_the_event(idle, opened):
+    page = armed_page(opened)
+
+    def move(target_mm):
+        page.fill("#target", f"{target_mm}")
+        with page.expect_response("**/v1/move"):
+            page.click("#move")
+        expect(page.locator("#command-text")).to_have_text("move: done", timeout=PATIENCE_MS)
+        state_is(page, "armed")
+
+    move(20)
+    move(10)
+    page.select_option("#window", "1")
+    page.select_option("#trigger", "reversal")
+    page.check("#single")
+    chip = page.locator("#trigger-state")
+    expect(chip).to_have_text("waits for the trigger")
+    move(20)
+    expect(chip).to_have_text("triggered", timeout=PATIENCE_MS)
+    expect(page.locator("#hold")).to_have_text("Next")
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")  # drawn
+    shot = saved_samples(page)
+    times_s = [float(one["t_s"]) for one in shot]
+    setpoints_m = [float(one["setpoint_position_m"]) for one in shot]
+    turn = next(at for at in range(1, len(shot)) if setpoints_m[at] - setpoints_m[at - 1] > 1e-8)
+    assert times_s[-1] - times_s[0] == pytest.approx(1.0, abs=0.03)
+    assert times_s[turn] - times_s[0] == pytest.approx(0.25, abs=0.03)
+    page.click("#stop")
+    state_is(page, "idle")
+    assert saved_samples(page) == shot  # whatever comes
+    page.click("#hold")
+    expect(chip).to_have_text("waits for the trigger")
+
+
 MARKUP = "<img src=x onerror='document.title=1'>"
 
 
@@ -332,7 +376,8 @@ def rows_of(setpoints=(), errors=(), contacts=()):
     count = max(len(setpoints), len(errors), len(contacts))
     column = lambda values: list(values) or [0.0] * count  # noqa: E731
     triples = zip(column(setpoints), column(errors), column(contacts), strict=True)
-    return [[0.01 * i, 0.0, 0.0, s, e, 0.0, 0.0, 0.0, c, 0] for i, (s, e, c) in enumerate(triples)]
+    tracking = int(Phase.TRACKING)
+    return [[0.01 * i, 0.0, 0.0, s, e, 0.0, 0.0, 0.0, c, tracking] for i, (s, e, c) in enumerate(triples)]
 
 
 READOUT = """async ([rows, a, b]) => {
@@ -392,6 +437,63 @@ def test_a_stop_that_nobody_hears_says_so(idle, opened):
     expect(page.locator("#alarm")).to_be_hidden()  # said again, and heard
 
 
+def test_a_page_that_was_not_told_its_role_stops_all_the_same_and_asks_again(idle, opened):
+    page = opened(Role.OPERATE)
+    page.route("**/session", lambda route: route.abort())
+    page.reload()
+    expect(page.locator("#state")).not_to_have_attribute("data-state", "lost", timeout=PATIENCE_MS)
+    with page.expect_response("**/v1/stop") as answered:
+        page.click("#stop")
+    assert answered.value.status == 202
+    page.locator("#take").click(force=True)
+    expect(page.locator("#refusal")).to_contain_text("has not said yet")
+    page.unroute("**/session")
+    page.locator("#take:not([aria-disabled=true])").click()
+    expect(page.locator("#lease")).to_have_text("this page operates", timeout=PATIENCE_MS)
+    page.click("#take")
+
+
+def test_an_observer_s_escape_key_says_that_it_stops_nothing(idle, opened):
+    page = opened(Role.OBSERVE)
+    expect(page.locator("#stop")).to_be_disabled()
+    page.keyboard.press("Escape")
+    expect(page.locator("#alarm")).to_contain_text("STOP was not sent")
+
+
+def test_a_step_whose_answer_got_lost_is_not_done_twice(idle, opened):
+    page = armed_page(opened)
+    keys = []
+
+    def lose_the_first_answer(route):
+        keys.append(route.request.headers["idempotency-key"])
+        answer = route.fetch()
+        if len(keys) == 1:
+            route.fulfill(status=502, json={"kind": "LinkError", "message": "no answer from the service."})
+        else:
+            route.fulfill(response=answer)
+
+    page.route("**/v1/jog", lose_the_first_answer)
+    before_m = idle.client.status().positions.end_position_m
+    step, way_m = ("#step-left", -1e-3) if before_m > 0.01 else ("#step-right", 1e-3)
+    page.fill("#distance", "1")
+    page.select_option("#distance-unit", label="mm")
+    page.click(step)
+    expect(page.locator("#refusal")).to_contain_text("pressed again, it is not done twice")
+    expect(page.locator("#command-text")).to_have_text("jog: done", timeout=PATIENCE_MS)
+    state_is(page, "armed")
+    with page.expect_response("**/v1/jog"):
+        page.click(step)
+    expect(page.locator("#refusal")).to_be_hidden()
+    state_is(page, "armed")
+    assert idle.client.status().positions.end_position_m == pytest.approx(before_m + way_m, abs=1e-4)
+    with page.expect_response("**/v1/jog"):
+        page.click(step)
+    idle.until(lambda: abs(idle.client.status().positions.end_position_m - before_m) > 1.5e-3, "the second step")
+    assert keys[0] == keys[1] != keys[2]
+    page.click("#stop")
+    state_is(page, "idle")
+
+
 def test_a_trigger_fires_at_the_first_rise_contact_or_reversal(opened):
     page = opened(Role.OBSERVE)
 
@@ -403,9 +505,24 @@ def test_a_trigger_fires_at_the_first_rise_contact_or_reversal(opened):
     assert first(errors, "error", 5e-6, begin=3) == 5
     assert first(errors, "error", 8e-6) == -1
     assert first(rows_of(errors=[None, 9e-6, 9e-6]), "error", 5e-6) == -1  # no rise was seen
+    late = rows_of(errors=[0.0, None, 9e-6, None, 9e-6, 0.0, None])
+    assert first(late, "error", 5e-6) == 2  # across a late line
+    assert first(late, "error", 5e-6, begin=2) == 2
+    assert first(late, "error", 5e-6, begin=3) == -1  # across another it goes on
     assert first(rows_of(contacts=[0.2, -0.9, -1.0, 2.0]), "contact", 1.0) == 2
     there_and_back = rows_of(setpoints=[0.0, 1e-3, 2e-3, 2e-3, 2e-3, 1e-3, 0.0])
     assert first(there_and_back, "reversal") == 5  # over the rest between
     assert first(rows_of(setpoints=[0.0, 0.0, 1e-3, 2e-3]), "reversal") == -1  # a beginning is no reversal
     assert first(rows_of(setpoints=[1e-3, 2e-3, None, 2e-3, 1e-3]), "reversal") == -1
     assert first(there_and_back, "none") == -1
+    for phase in Phase:
+        swings = rows_of(errors=[0.0, 9e-6], contacts=[0.0, 2.0])
+        turns = rows_of(setpoints=[0.0, 1e-3, 0.0])
+        for row in swings + turns:
+            row[-1] = int(phase)
+        fires = phase in TICKING  # without power nothing is followed
+        assert first(swings, "error", 5e-6) == first(swings, "contact", 1.0) == (1 if fires else -1), phase
+        assert first(turns, "reversal") == (2 if fires else -1), phase
+    begins = rows_of(errors=[9e-6, 9e-6, 9e-6])
+    begins[0][-1] = int(Phase.IDLE)
+    assert first(begins, "error", 5e-6) == 1  # armed away from its set-point

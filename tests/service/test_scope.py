@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from stagectl.requests import Phase
 from stagectl.row import new_rows
 from stagectl.service.scope import COLUMNS, Scope
 
@@ -42,3 +43,19 @@ def test_a_late_line_is_no_error():
     first, second = (row[ERROR] for row in scope.after(0).rows)
     assert first == pytest.approx(1e-6)
     assert math.isnan(second)
+
+
+def test_what_swings_without_power_is_no_error_of_a_sample_with_it():
+    errors_m = np.full(30, 1e-6)
+    errors_m[[8, 25]] = 1e-4
+    rows = moving_rows(30, errors_m)
+    rows["run_phase"] = Phase.TRACKING
+    rows["run_phase"][[6, 7, 8, 9]] = Phase.IDLE
+    rows["run_phase"][20:26] = Phase.IDLE
+    scope = Scope(1000.0)
+    scope.add(rows)
+    assert [row[ERROR] for row in scope.after(0).rows] == [
+        pytest.approx(1e-6),
+        pytest.approx(1e-6),
+        pytest.approx(1e-4),
+    ]

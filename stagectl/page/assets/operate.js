@@ -8,6 +8,7 @@ const JOG_HOLD_S = 0.3;
 const JOG_AGAIN_MS = 90;
 const STOP_AGAIN_MS = 250;
 const STOP_TRIES = 12;
+const ALARM_MS = 5000;
 const OVER = ['done', 'failed'];
 
 const byId = (id) => document.getElementById(id);
@@ -17,7 +18,8 @@ export class Operator {
   constructor() {
     this.token = '';
     this.status = null;
-    this.mayOperate = false;
+    this.mayOperate = null; // until the page's process has said
+    this.unanswered = null; // the press that nobody answered: {what, pressKey}
     this.renewedAt = 0;
     this.renewing = false;
     this.jog = 0; // direction that is held now
@@ -41,8 +43,8 @@ export class Operator {
 
   // ---- talking ----
 
-  async ask(method, path, body, more = {}) {
-    const headers = { 'Stagectl-Page': key, ...(this.token ? { 'Stagectl-Lease': this.token } : {}), ...(body === undefined ? {} : { 'Content-Type': 'application/json' }) };
+  async ask(method, path, body, more = {}, moreHeaders = {}) {
+    const headers = { ...moreHeaders, 'Stagectl-Page': key, ...(this.token ? { 'Stagectl-Lease': this.token } : {}), ...(body === undefined ? {} : { 'Content-Type': 'application/json' }) };
     let answer;
     try {
       answer = await fetch(`/v1/${path}`, { method, headers, body: body === undefined ? undefined : JSON.stringify(body), ...more });
@@ -54,9 +56,25 @@ export class Operator {
     return found;
   }
 
+  // What is done once a press. A press without an answer may have been heard: the same press again sends its key again,
+  // and the service then tells what became of the first in place of doing it twice.
+  async press(method, path, body) {
+    const what = JSON.stringify([method, path, body]);
+    const pressKey = this.unanswered?.what === what ? this.unanswered.pressKey : `page-${crypto.randomUUID()}`;
+    try {
+      const found = await this.ask(method, path, body, {}, { 'Idempotency-Key': pressKey });
+      this.unanswered = null;
+      return found;
+    } catch (error) {
+      this.unanswered = error.code === undefined || error.code === 502 ? { what, pressKey } : null;
+      if (this.unanswered) error.message += ' It may have been heard; pressed again, it is not done twice.';
+      throw error;
+    }
+  }
+
   async command(path, body, method = 'POST') {
     this.refuse('');
-    try { return await this.ask(method, path, body); } catch (error) { this.refuse(error.message); return null; }
+    try { return await this.press(method, path, body); } catch (error) { this.refuse(error.message); return null; }
   }
 
   refuse(text) {
@@ -70,10 +88,10 @@ export class Operator {
     this.refuse('');
     try {
       if (this.token) {
-        await this.ask('DELETE', 'lease');
+        await this.press('DELETE', 'lease');
         this.token = '';
       } else {
-        const taken = await this.ask('POST', 'lease', { holder: 'the live page', duration_s: LEASE_S });
+        const taken = await this.press('POST', 'lease', { holder: 'the live page', duration_s: LEASE_S });
         this.token = taken.token;
         this.renewedAt = performance.now();
       }
@@ -154,7 +172,12 @@ export class Operator {
 
   async stop() {
     this.jog = 0;
-    if (!this.mayOperate || this.stopping) return;
+    if (this.mayOperate === false) {
+      this.alarm('STOP was not sent: this page may only watch. Use `stagectl stop` or the emergency stop.');
+      setTimeout(() => this.alarm(''), ALARM_MS);
+      return;
+    }
+    if (this.stopping) return;
     this.stopping = true;
     byId('stop').classList.add('pressed');
     this.refuse('');
@@ -189,7 +212,7 @@ export class Operator {
   update(status) {
     this.status = status;
     if (this.token && !status.lease && performance.now() - this.renewedAt > 2 * LEASE_S * 1e3) this.token = '';
-    if (!this.stopping && !isPowered(status.state)) this.alarm('');
+    if (this.mayOperate && !this.stopping && !isPowered(status.state)) this.alarm('');
     this.renew();
     this.followCommand(status.command);
     this.show();

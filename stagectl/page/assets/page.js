@@ -249,11 +249,18 @@ async function showRuns() {
   write('runs-note', runs.length ? `${runs.length} in all; a name opens its report, drawn when it is first asked for` : 'none yet');
 }
 
-async function begin() {
-  scope = new Scope(byId('plots'));
+// Asked until it is answered: an operator's page must not stay without STOP because one answer got lost.
+async function askRole() {
   const answer = await fetch('/session').catch(() => null);
-  operator.setRole(answer?.ok ? (await answer.json()).role : 'observe');
+  const found = answer?.ok ? await answer.json().catch(() => null) : null;
+  if (!found) { setTimeout(askRole, AGAIN_MS); return; }
+  operator.setRole(found.role);
   operator.show();
+}
+
+function begin() {
+  scope = new Scope(byId('plots'));
+  askRole();
   listen();
   showRuns();
   showLog();

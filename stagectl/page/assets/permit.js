@@ -1,5 +1,6 @@
 // What a state means, and why a button can't be pressed now: pure. A situation is
-// {status, held, mayOperate, jogging}: the newest status or null, whether this page has the lease, what it may do.
+// {status, held, mayOperate, jogging}: the newest status or null, whether this page has the lease, what it may do (null:
+// not known yet).
 
 const POWERED = ['arming', 'armed', 'moving', 'identifying', 'stopping'];
 const UNDER_WAY = {
@@ -65,6 +66,7 @@ export const BUTTONS = Object.keys(WHY_NOT);
 
 // Why the button with this id can't be used now; '' where it can.
 export function whyNot(id, situation) {
+  if (situation.mayOperate === null) return 'the page\'s process has not said yet who operates here';
   if (!situation.mayOperate) return 'this page may only watch; open the link to operate in this browser';
   if (!situation.status) return 'the service doesn\'t answer';
   return WHY_NOT[id](situation);
