@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from bench import service, service_batch, service_processes
+from bench.figure import judged
 from bench.journal import APART, Journal, beside_figures, sources_hash
 from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
+from bench.service_processes import COUNT, COUNT_FULL
 from tests.faults import losses, real
 from tests.faults.judge import BACK, LOST, TRAVEL, _bound_m
 from tests.faults.mechanics import mechanics_of
@@ -153,10 +155,39 @@ def test_when_the_drives_stopped_is_read_from_the_rig_s_log():
 
 def test_the_last_figure_is_how_long_all_parts_took(monkeypatch):
     monkeypatch.setattr(service, "PARTS", {"soak": lambda **_: iter(()), "batch": lambda **_: iter(())})
-    (figure,) = service.figures(full=False, say=lambda text: None)
+    ended, figure = service.figures(full=False, say=lambda text: None)
+    assert (ended.value, ended.holds) == (2, True)
     assert (figure.figure, figure.bar, figure.holds) == ("all parts together", "<= 900 s", True)
     assert figure.reason == "soak 0 s, batch 0 s"
-    assert list(service.figures(full=False, say=lambda text: None, part="soak")) == []
+    assert len(list(service.figures(full=False, say=lambda text: None, part="soak"))) == 1
+
+
+def test_a_part_that_breaks_takes_no_other_along_and_is_a_missed_bar(monkeypatch):
+    def breaks(**_):
+        yield judged(service_batch.COUNT, 60)
+        raise RuntimeError("the servo was made anew")
+
+    monkeypatch.setattr(service, "PARTS", {"soak": breaks, "batch": lambda **_: iter([judged(COUNT, 10)])})
+    first, second, ended, _ = service.figures(full=False, say=lambda text: None)
+    assert (first.holds, second.holds) == (True, True)
+    assert (ended.value, ended.holds) == (1, False)
+    assert ended.reason == "soak: RuntimeError: the servo was made anew"
+
+
+def test_too_few_runs_are_a_missed_bar():
+    entries = [entry("EMCY")] * 59
+    (figure, *_) = service_batch.of_entries(entries, list(range(59)), service_batch.COUNT)
+    assert figure.holds is False
+    assert service_batch.COUNT_FULL.limit == 900
+    assert (COUNT.limit, COUNT_FULL.limit) == (10, 100)
+
+
+def test_cycles_lost_with_real_processes_are_a_missed_bar(monkeypatch):
+    scenario = real.drawn(0)
+    lost = real.RealResult(0, scenario, "LinkError", ((LOST, "7 cycles on the bus have no row"),), 0.0, 0.0, 1.0)
+    monkeypatch.setattr(real, "run", lambda seed, folder: lost)
+    found = {one.figure: one for one in service_processes.figures(full=False, say=lambda text: None, seeds=[0])}
+    assert found[f"real processes: {LOST}"].holds is False
 
 
 def test_parts_are_named():
