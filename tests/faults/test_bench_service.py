@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from bench import service, service_batch, service_processes
@@ -15,7 +16,7 @@ from bench.figure import judged
 from bench.journal import APART, Journal, beside_figures, sources_hash
 from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
-from bench.service_processes import COUNT, COUNT_FULL
+from bench.service_processes import COUNT, COUNT_FULL, FULL_LOSS_SEEDS, LOSS_SEEDS
 from tests.faults import losses, real
 from tests.faults.judge import BACK, LOST, TRAVEL, _bound_m
 from tests.faults.mechanics import mechanics_of
@@ -123,19 +124,61 @@ def test_the_seeded_part_has_every_process_killed_and_stopped_in_every_motion():
     assert len({one.profile for one in drawn}) == 2
 
 
-def test_rows_are_held_against_the_syncs_of_the_newest_run(tmp_path, monkeypatch):
-    """Two runs; the second has 40 rows, of which 3 in the middle are missing, and 2 SYNCs come behind its last."""
-    t_ns = np.arange(100) * 1_000_000
-    files = {"1": t_ns[:20], "2": np.delete(t_ns[50:90], [10, 11, 12])}
-    for name in files:
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "samples.arrow").write_bytes(b"")
+def test_a_kill_and_a_cut_are_drawn_from_a_seed_in_every_phase_that_is_recorded():
+    every = {name: [losses.drawn(seed) for seed in seeds] for name, seeds in FULL_LOSS_SEEDS.items()}
+    assert [one.text for one in every["servo"]] == [losses.drawn(seed).text for seed in FULL_LOSS_SEEDS["servo"]]
+    drawn = [one for strikes in every.values() for one in strikes]
+    assert {one.scene.phase for one in drawn} >= {*MOTIONS, "at rest"}
+    assert {one.supervisor_looks_away for one in every["servo"]} == {True, False}
+    assert all(len(strikes) >= 10 for strikes in every.values())
+    assert all(len({one.scene.profile for one in strikes}) == 2 for strikes in every.values())
+    few = {name: [losses.drawn(seed) for seed in seeds] for name, seeds in LOSS_SEEDS.items()}
+    assert any(one.supervisor_looks_away and one.scene.phase == "jogging" for one in few["servo"])  # told by the rig
+    assert any(one.scene.profile == "oled-printer" for one in few["power"])
+    assert all(one.scene.phase in MOTIONS for strikes in few.values() for one in strikes)
+
+
+def loss_of(folder, rows_ns, syncs_ns, until_ns=99_000_000):
+    """Held against the SYNCs of 0.1 s with power, by two runs, the first of them from before."""
+    for name, t_ns in {"1": np.zeros(0, np.int64), "2": rows_ns}.items():
+        (folder / name).mkdir(parents=True)
+        table = pa.table(
+            {"t_ns": t_ns, "run_phase": t_ns * 0, "stop": t_ns * 0, "setpoint_velocity_m_per_s": t_ns * 0.0}
+        )
+        with pa.ipc.new_stream(str(folder / name / "samples.arrow"), table.schema) as stream:
+            stream.write_table(table)
+    seen = {"t_ns": np.arange(102) * 1_000_000, "states": np.full((102, 2), ENABLED), "sync_t_ns": syncs_ns}
+    return losses.loss_of(folder, seen, -1, until_ns)
+
+
+@pytest.mark.parametrize(
+    ("gone", "silent", "lost"),
+    [
+        ([], [], 0),
+        ([40, 41, 42], [], 3),
+        (list(range(40, 60)), list(range(10, 30)), 20),  # rows without a SYNC hide none that is missing
+        ([99], [], 1),  # the last one is not forgiven
+        ([98, 99], [], 2),
+        ([0, 1, 2], [], 2),  # nor is the head, but for a cycle whose row is from before
+    ],
+)
+def test_every_sync_is_owed_a_row_of_its_own(tmp_path, monkeypatch, gone, silent, lost):
     monkeypatch.setattr(losses, "read_run", lambda folder: None)
-    monkeypatch.setattr(losses, "_t_ns_of", lambda path: files[path.parent.name])
-    seen = {"sync_t_ns": t_ns[:92] + 500_000}
-    found = losses.loss_of(tmp_path, seen, 0, int(t_ns[-1]))
-    assert (found.syncs_count, found.rows_count, found.cycles_lost) == (42, 37, 4)
-    assert losses.loss_of(tmp_path, seen, int(t_ns[95]), int(t_ns[-1])).rows_count == 0
+    ms = np.arange(100) * 1_000_000
+    found = loss_of(tmp_path, np.delete(ms, gone), np.delete(ms + 400_000, silent), 100_000_000)
+    assert found.cycles_lost == lost
+    assert found.unreadable == ()
+
+
+def test_a_run_that_cant_be_read_is_counted(tmp_path):
+    found = loss_of(tmp_path, np.arange(100) * 1_000_000, np.arange(100) * 1_000_000 + 400_000)
+    assert len(found.unreadable) == 2  # they have no manifest
+
+
+def test_only_a_cycle_that_may_have_been_under_way_is_owed_no_row():
+    seen = {"sync_t_ns": np.arange(100) * 1_000_000 + 400_000}
+    assert losses.counted_until(seen, 99_900_000) == 99_399_999
+    assert losses.counted_until(seen, 100_500_000) == 99_400_000
 
 
 def test_when_the_drives_stopped_is_read_from_the_rig_s_log():
