@@ -31,10 +31,9 @@ from stagectl.record import read_run
 from stagectl.ring import RingReader
 from tests.faults import real
 from tests.faults.house import House
-from tests.faults.judge import REST_M_PER_S, Record, _cycles_lost
+from tests.faults.judge import REST_M_PER_S, Record
 from tests.faults.kinds import CYCLE_S
-from tests.faults.scene import Facts
-from tests.faults.witness import ENABLED
+from tests.faults.witness import ENABLED, STOPPING
 from tests.service.daemon import servo_pid
 
 SHIPPED_HEARTBEAT_S = load_profile("single-axis").trip.heartbeat_s
@@ -93,11 +92,8 @@ def drawn(seed: int) -> Strike:
     return Strike(seed, scene, bool(np.random.default_rng([seed, 8]).random() < 0.5))
 
 
-def loss_of(runs: Path, seen: dict[str, np.ndarray], begun_t_ns: int, until_t_ns: int, phase: str = "") -> Loss:
-    """Hold the rows of all runs against the SYNCs between two instants, each cycle by itself, as the judge does.
-
-    A row too many hides none that is missing; the first and the last cycle count like any other.
-    """
+def loss_of(runs: Path, seen: dict[str, np.ndarray], begun_t_ns: int, until_t_ns: int) -> Loss:
+    """Hold the rows of all runs against the SYNCs between two instants, in which an axis had power, each by itself."""
     folders = [folder for folder in sorted(runs.iterdir()) if (folder / "samples.arrow").exists()]
     record, bad = Record(folders), []
     for folder in folders:
@@ -105,12 +101,33 @@ def loss_of(runs: Path, seen: dict[str, np.ndarray], begun_t_ns: int, until_t_ns
             read_run(folder)
         except (StagectlError, OSError) as error:
             bad.append(f"{folder.name}: {error}")
-    syncs = seen["sync_t_ns"][seen["sync_t_ns"] <= until_t_ns]
-    facts = Facts(begun_t_ns=begun_t_ns, judged_until_t_ns=until_t_ns, phase=phase, seen=seen, sync_t_ns=syncs)
-    lost = _cycles_lost(facts, record, seen["t_ns"].size)
-    t_ns = record.columns["t_ns"]
+    syncs, t_ns = seen["sync_t_ns"], record.columns["t_ns"]
+    at = np.searchsorted(seen["t_ns"], syncs).clip(max=seen["t_ns"].size - 1)
+    powered = np.isin(seen["states"][at], (ENABLED, *STOPPING)).any(axis=1)
+    owed = powered & (syncs >= begun_t_ns) & (syncs <= until_t_ns)
     rows_count = int(((t_ns >= begun_t_ns) & (t_ns <= until_t_ns)).sum())
-    return Loss(int((syncs >= begun_t_ns).sum()), rows_count, lost, (*record.unreadable, *bad))
+    lost = int((unmatched(t_ns, syncs) & owed).sum())
+    return Loss(int(owed.sum()), rows_count, lost, (*record.unreadable, *bad))
+
+
+def unmatched(rows_t_ns: np.ndarray, syncs_t_ns: np.ndarray) -> np.ndarray:
+    """Return which SYNCs have no row of their own: one begun before them, less than `HICCUP_S` ago, and not taken.
+
+    A host that holds the rig up has it hear two SYNCs at once, and one behind the next row. A row without a SYNC hides
+    a missing row no longer than `HICCUP_S`.
+    """
+    free: list[int] = []
+    alone, k, patience_ns = np.zeros(syncs_t_ns.size, bool), 0, round(1e9 * real.HICCUP_S)
+    rows = rows_t_ns.tolist()
+    for number, sync in enumerate(syncs_t_ns.tolist()):
+        while k < len(rows) and rows[k] <= sync:
+            free.append(rows[k])
+            k += 1
+        if free and sync - free[-1] <= patience_ns:
+            free.pop()
+        else:
+            alone[number] = True
+    return alone
 
 
 def counted_until(seen: dict[str, np.ndarray], killed_t_ns: int) -> int:
@@ -181,7 +198,7 @@ def after_servo_kill(folder: Path, strike: Strike) -> tuple[Loss, Stopped | None
                 seen = house.look_back()
         house.daemon.state_is("fault", "idle")
         _until_closed(house.daemon.runs)
-        loss = loss_of(house.daemon.runs, seen, begun_t_ns, counted_until(seen, killed_t_ns), scene.phase)
+        loss = loss_of(house.daemon.runs, seen, begun_t_ns, counted_until(seen, killed_t_ns))
         at = min(int(np.searchsorted(seen["t_ns"], killed_t_ns)), seen["t_ns"].size - 1)
         follows = strike.supervisor_looks_away and seen["states"][at, 0] == ENABLED
         return loss, stopped(seen, killed_t_ns) if follows else None
@@ -204,7 +221,7 @@ def after_supervisor_kill(folder: Path, strike: Strike) -> Loss:
             time.sleep(0.1)
         with contextlib.suppress(StagectlError):  # the rig stays for five seconds
             house.look_back()
-        return loss_of(house.daemon.runs, house.seen, begun_t_ns, int(house.seen["t_ns"][-1]), strike.scene.phase)
+        return loss_of(house.daemon.runs, house.seen, begun_t_ns, int(house.seen["t_ns"][-1]))
     finally:
         house.close()
 
@@ -223,7 +240,7 @@ def after_both_killed(folder: Path, strike: Strike) -> Loss:
         house.daemon.client.lease_token = ""
         house.daemon.state_is("idle", "fault")
         _until_closed(house.daemon.runs)
-        return loss_of(house.daemon.runs, seen, begun_t_ns, counted_until(seen, killed_t_ns), strike.scene.phase)
+        return loss_of(house.daemon.runs, seen, begun_t_ns, counted_until(seen, killed_t_ns))
     finally:
         house.close()
 
@@ -265,7 +282,7 @@ def after_power_cut(folder: Path, strike: Strike) -> Loss:
         finally:
             house.close()
     with _disk(folder / "image", folder / "after") as disk:
-        return loss_of(disk / "runs", seen, begun_t_ns, cut_t_ns, strike.scene.phase)
+        return loss_of(disk / "runs", seen, begun_t_ns, cut_t_ns)
 
 
 def _cut(disk: Path) -> None:
