@@ -135,7 +135,8 @@ def _changes(node: ast.AST, parent: ast.AST) -> Iterator[tuple[ast.AST, str]]:
         ast.copy_location(new, node)
         ast.fix_missing_locations(new)
         yield new, f"{place}{_said(node)} -> {_said(new)}"
-    if isinstance(node, ast.stmt) and isinstance(node, _DELETED):
+    called = isinstance(node, ast.Expr) and not isinstance(node.value, ast.Constant)  # no docstring
+    if isinstance(node, ast.stmt) and (called or isinstance(node, _DELETED)):
         yield ast.copy_location(ast.Pass(), node), f"{_said(node)} -> nothing"
 
 

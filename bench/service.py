@@ -7,6 +7,7 @@ its journal ends.
 """
 
 import time
+import traceback
 from collections.abc import Callable, Iterator
 
 from bench import service_batch, service_mutants, service_processes, ten_pages
@@ -28,6 +29,7 @@ PARTS: dict[str, Callable[..., Iterator[Figure]]] = {
     "soak": service_processes.soak_figures,
 }
 """By the name that `--part` takes."""
+ENDED = "parts that came to their end"
 TIME, TIME_FULL = Bar("all parts together", "s", 900.0), Bar("all parts together", "s")
 
 
@@ -39,12 +41,19 @@ def figures(*, full: bool, say: Say, seed: int | None = None, part: str | None =
         return
     if part is not None and part not in PARTS:
         raise SystemExit(f"bench service --part {part}: choose from {', '.join(PARTS)}")
-    begin_s, took = time.monotonic(), []
+    begin_s, took, broken, ended = time.monotonic(), [], [], 0
     for name, measure in PARTS.items():
         if part in (None, name):
             say(name)
             part_begin_s = time.monotonic()
-            yield from measure(full=full, say=say)
+            try:
+                yield from measure(full=full, say=say)
+                ended += 1
+            except Exception as error:  # noqa: BLE001 - it takes no other part along, and is a missed bar
+                say(traceback.format_exc())
+                broken.append(f"{name}: {type(error).__name__}: {error}")
             took.append(f"{name} {time.monotonic() - part_begin_s:.0f} s")
+    wanted = len(PARTS) if part is None else 1
+    yield judged(Bar(ENDED, "parts", wanted, True), ended, reason="; ".join(broken))
     if part is None:
         yield judged(TIME_FULL if full else TIME, time.monotonic() - begin_s, reason=", ".join(took))

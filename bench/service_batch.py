@@ -20,7 +20,9 @@ FULL_RUNS = 900
 BEGUN = Bar("batch: stop begun after fault detection, worst run", "cycles", BEGUN_CYCLES)
 MISSED = {name: Bar(f"batch: {name}", "cycles" if name == LOST else "runs", 0.0) for name in BARS if name != BACK}
 RECOVERED = Bar("batch: armed again without a restart, where the fault is gone", "%", 100.0, True)
-COUNT = Bar("batch: runs", "runs")
+COUNT = Bar("batch: runs", "runs", RUNS, True)
+COUNT_FULL = Bar("batch: runs", "runs", FULL_RUNS, True)
+COUNT_ONE = Bar("batch: runs", "runs")  # of a run that is played again
 TIME = Bar("batch: time of a run, mean", "s")
 
 Say = Callable[[str], None]
@@ -38,7 +40,8 @@ def figures(*, full: bool, say: Say, seeds: Sequence[int] | None = None) -> Iter
                 say(entry["line"])
             elif count % 10 == 0:
                 say(f"{count} of {len(missing)} runs")
-    yield from of_entries([journal.entries[seed] for seed in wanted], wanted)
+    count = COUNT_ONE if seeds is not None else COUNT_FULL if full else COUNT
+    yield from of_entries([journal.entries[seed] for seed in wanted], wanted, count)
 
 
 def _played(seeds: list[int], folder: Path) -> Iterator[dict]:
@@ -76,10 +79,10 @@ def as_entry(result: campaign.Result) -> dict:
     }
 
 
-def of_entries(entries: list[dict], seeds: list[int]) -> Iterator[Figure]:
-    """Hold all runs together against each bar."""
+def of_entries(entries: list[dict], seeds: list[int], count: Bar = COUNT_ONE) -> Iterator[Figure]:
+    """Hold all runs together against each bar; `count`: that of how many there must be."""
     played = [entry for entry in entries if not entry["skipped"]]
-    yield judged(COUNT, len(played), seeds, _skipped(entries))
+    yield judged(count, len(played), seeds, _skipped(entries))
     for name, bar in MISSED.items():
         missed = [entry for entry in played if any(bar_name == name for bar_name, _ in entry["violations"])]
         value = sum(entry["cycles_lost"] for entry in played) if name == LOST else len(missed)

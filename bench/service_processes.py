@@ -1,5 +1,6 @@
 """Faults with real processes, what a recording loses, and the memory of a long session."""
 
+import itertools
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -8,22 +9,27 @@ from pathlib import Path
 from bench.figure import Bar, Figure, absent, judged
 from bench.journal import Journal, beside_figures
 from tests.faults import losses, real, soak
-from tests.faults.judge import BACK, BARS, BEGUN, GENTLE, LOST, TRAVEL
+from tests.faults.judge import BACK, BARS, BEGUN, GENTLE, TRAVEL
 from tests.faults.kinds import CYCLE_S
 
 SEEDS = (1, 11, 26, 33, 35, 36, 38, 41, 62, 99)  # what only processes can show, two faults of the wire, all motions
 FULL_RUNS = 100
-_SOAK_S, _FULL_SOAK_S, _WARM_UP_S = 150.0, 1200.0, 30.0
-_CUTS_S = (0.0, 1.5)  # of jogging
-_FULL_CUTS_S = tuple(0.3 * k for k in range(10))
+_SOAK_S, _FULL_SOAK_S, _WARM_UP_S = 180.0, 1200.0, 30.0
+LOSS_SEEDS = {"servo": (9,), "supervisor": (6,), "both": (1,), "power": (5, 37)}  # one of the cuts with a micro
+FULL_LOSS_SEEDS = {"servo": range(10), "supervisor": range(10, 20), "both": range(20, 30), "power": range(30, 40)}
 
-COUNT = Bar("real processes: runs", "runs")
-MISSED = {name: Bar(f"real processes: {name}", "runs", 0.0) for name in BARS if name not in (BACK, BEGUN, LOST)}
-RECOVERED = Bar("real processes: armed again without a restart, of a killed supervisor by systemd's", "%", 100.0, True)
+COUNT = Bar("real processes: runs", "runs", 10.0, True)
+COUNT_FULL = Bar("real processes: runs", "runs", FULL_RUNS, True)
+COUNT_ONE = Bar("real processes: runs", "runs")  # of a run that is played again
+MISSED = {name: Bar(f"real processes: {name}", "runs", 0.0) for name in BARS if name not in (BACK, BEGUN)}
+RECOVERED = Bar(
+    "real processes: armed again, a killed supervisor started again by the test as systemd does", "%", 100.0, True
+)
 LOST_SERVO = Bar("recorded cycles lost, kill -9 of the servo", "cycles", 0.0)
 STOP_BEGUN = Bar("drive-side stop begun after kill -9 of the servo, worst", "s", losses.SHIPPED_HEARTBEAT_S)
-STOP_ENDED = Bar("and at rest after that, from 0.12 m/s at 5 m/s^2 (24 ms by the ramp alone), worst", "s")
+STOP_ENDED = Bar("and at rest after that, from 0.25 m/s at most at 5 m/s^2 (50 ms by the ramp alone), worst", "s")
 LOST_SUPERVISOR = Bar("recorded cycles lost, kill -9 of the supervisor", "cycles", 0.0)
+LOST_BOTH = Bar("recorded cycles lost, kill -9 of servo and supervisor", "cycles", 0.0)
 LOST_POWER = Bar("recorded time lost, power cut in mid motion, worst", "s", 0.25)
 _WATCHES = "the drive that misses 20 SYNCs is sooner than its heartbeat watch"
 UNREADABLE = Bar("runs unreadable after kill or power cut", "runs", 0.0)
@@ -61,44 +67,65 @@ def figures(*, full: bool, say: Say, seeds: Sequence[int] | None = None) -> Iter
     entries = [entry for entry in played if not entry["skipped"]]
     kinds, phases = (", ".join(sorted({entry[name] for entry in entries})) for name in ("kind", "phase"))
     said = [f"{kinds}; {phases}", *{entry["skipped"] for entry in played} - {""}]
-    yield judged(COUNT, len(entries), wanted, "; skipped: ".join(said))
+    count = COUNT_ONE if seeds is not None else COUNT_FULL if full else COUNT
+    yield judged(count, len(entries), wanted, "; skipped: ".join(said))
     for name, bar in MISSED.items():
         missed = [entry["line"] for entry in entries if any(one == name for one, _ in entry["violations"])]
         said = f"{GENTLE}; t with what the host held servo or rig up, and 5 ms" if name == TRAVEL else ""
         yield judged(bar, len(missed), reason="; ".join(missed[:3]) or said)
     lame = [entry["line"] for entry in entries if any(one == BACK for one, _ in entry["violations"])]
-    yield judged(RECOVERED, 100.0 * (1.0 - len(lame) / max(len(entries), 1)), reason="; ".join(lame[:3]))
+    share = 100.0 * (1.0 - len(lame) / len(entries)) if entries else float("nan")
+    yield judged(RECOVERED, share, reason="; ".join(lame[:3]))
 
 
 def loss_figures(*, full: bool, say: Say) -> Iterator[Figure]:
     """Kill and cut, and count the rows that are left against the SYNCs that the rig heard."""
+    seeds = FULL_LOSS_SEEDS if full else LOSS_SEEDS
+    strikes = {name: [losses.drawn(seed) for seed in chosen] for name, chosen in seeds.items()}
     unreadable: list[str] = []
     with tempfile.TemporaryDirectory(prefix="stagectl-loss-") as folder:
-        times = range(5 if full else 1)
-        killed = [losses.after_servo_kill(Path(folder) / f"servo{k}") for k in times]
-        stops = [stop for _, stop in killed]
-        begun = ", ".join(f"{stop.begun_s * 1e3:.0f} ms" for stop in stops)
-        yield judged(STOP_BEGUN, max(stop.begun_s for stop in stops), reason=f"by the rig's log: {begun}; {_WATCHES}")
-        yield judged(STOP_ENDED, max(stop.rest_s for stop in stops))
-        for bar, found in (
-            (LOST_SERVO, [loss for loss, _ in killed]),
-            (LOST_SUPERVISOR, [losses.after_supervisor_kill(Path(folder) / f"supervisor{k}") for k in times]),
-        ):
+        places = (Path(folder) / str(number) for number in itertools.count())
+        stops: list[losses.Stopped] = []
+
+        def after_servo_kill(place: Path, strike: losses.Strike) -> losses.Loss:
+            loss, stop = losses.after_servo_kill(place, strike)
+            stops.extend([stop] if stop is not None else [])
+            return loss
+
+        kills = {
+            "servo": (LOST_SERVO, after_servo_kill),
+            "supervisor": (LOST_SUPERVISOR, losses.after_supervisor_kill),
+            "both": (LOST_BOTH, losses.after_both_killed),
+        }
+        for name, (bar, kill) in kills.items():
+            found, counts = [], []
+            for strike in strikes[name]:
+                found.append(kill(next(places), strike))
+                one = found[-1]
+                counts.append(f"{strike.text}: {one.rows_count} rows of {one.syncs_count} SYNCs")
+                say(f"{bar.figure}: {counts[-1]}, {one.cycles_lost} lost")
             unreadable += [text for one in found for text in one.unreadable]
-            counts = ", ".join(f"{one.rows_count} rows of {one.syncs_count} SYNCs" for one in found[:3])
-            say(f"{bar.figure}: {counts}")
-            yield judged(bar, max(one.cycles_lost for one in found), reason=counts)
+            worst = max(one.cycles_lost for one in found)
+            yield judged(bar, worst, list(seeds[name]), "; ".join(counts[:3]))
+        begun = ", ".join(f"{stop.begun_s * 1e3:.0f} ms" for stop in stops)
+        said = f"by the rig's log: {begun}; {_WATCHES}"
+        nan = float("nan")
+        yield judged(STOP_BEGUN, max((stop.begun_s for stop in stops), default=nan), list(seeds["servo"]), said)
+        yield judged(STOP_ENDED, max((stop.rest_s for stop in stops), default=nan), list(seeds["servo"]))
         cuts: list[losses.Loss] = []
         try:
-            for k, jogged_s in enumerate(_FULL_CUTS_S if full else _CUTS_S):
-                cuts.append(losses.after_power_cut(Path(folder) / f"cut{k}", jogged_s))
-                say(f"power cut: {cuts[-1]}")
+            for strike in strikes["power"]:
+                cuts.append(losses.after_power_cut(next(places), strike))
+                say(f"power cut, {strike.text}: {cuts[-1]}")
         except losses.NotHere as error:
             yield absent(LOST_POWER, f"needs to mount a disk: {error}")
         unreadable += [text for one in cuts for text in one.unreadable]
         if cuts:
             lost = [one.cycles_lost for one in cuts]
-            yield judged(LOST_POWER, max(lost) * CYCLE_S, reason=f"cycles lost in {len(cuts)} cuts of a jog: {lost}")
+            said = (
+                f"cycles lost in {len(cuts)} cuts: {lost}; {'; '.join(strike.text for strike in strikes['power'][:3])}"
+            )
+            yield judged(LOST_POWER, max(lost) * CYCLE_S, list(seeds["power"]), said)
     yield judged(UNREADABLE, len(unreadable), reason="; ".join(unreadable[:3]))
 
 

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 from scipy.stats import wilcoxon
 
-from bench.ten_pages import INCREASE, INCREASE_LOAD, LATE, Window, Windows, figures_of, lower_limit
+from bench.ten_pages import (
+    INCREASE,
+    INCREASE_LOAD,
+    LATE,
+    WITH_PAGES,
+    Window,
+    Windows,
+    figures_of,
+    lower_limit,
+    with_power,
+)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -41,6 +51,29 @@ def test_a_load_without_a_client_has_a_row_of_its_own_and_excuses_nothing():
     figures = judged_windows(5, load_increase=5)
     assert figures[INCREASE.figure].holds is False
     assert (figures[INCREASE_LOAD.figure].value, figures[INCREASE_LOAD.figure].holds) == (5.0, None)
+
+
+def windows(held, missed=3):
+    window = Window(missed, 60_000, 60.0, True)
+    return Windows(window, window._replace(missed_count=-900, held=held), window)
+
+
+def test_windows_without_power_are_left_out_on_all_sides():
+    """A servo made anew counts from 0: its window would speak for the pages."""
+    found = {one.figure: one for one in figures_of([windows(True)] * 6)}
+    assert found[WITH_PAGES.figure].value == -900.0
+    kept = [Windows(*[Window(3, 60_000, 60.0, True)] * 3)] * 6
+    found = {one.figure: one for one in figures_of([*kept, windows(False)])}
+    assert found[WITH_PAGES.figure].value == 3.0
+    assert "power on in 6 of 7 pairs" in found[INCREASE.figure].reason
+    (few,) = figures_of([*kept[:4], windows(False)])
+    assert few.holds is False
+
+
+def test_windows_in_which_the_stage_lost_its_power_are_drawn_again():
+    drawn = iter([windows(False), windows(False), windows(True)])
+    assert with_power(lambda: next(drawn)).ten.held
+    assert not with_power(lambda: windows(False)).ten.held
 
 
 def test_late_lines_are_counted_in_each_kind_of_window():

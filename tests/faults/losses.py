@@ -1,7 +1,8 @@
-"""What a recording loses: rows against the SYNCs that the rig heard, after a kill and after a power cut, in a jog.
+"""What a recording loses: rows against the SYNCs that the rig heard, after a kill and after a power cut, of a seed.
 
-The profile says nothing of recording: a run goes from arming to disarming, and its rows are held against the SYNCs
-from its first row on, until the drives stand or the power is cut.
+Stage, phase of its work, speed and instant are drawn from the seed, and whether the supervisor looks on while its servo
+dies. The profile says nothing of recording: a run goes from arming to disarming, and its rows are held against the
+SYNCs from the phase's begin on, pair by pair as the campaign does, until the drives stand or the power is cut.
 
 A power cut is ext4's own shutdown without a flush (EXT4_IOC_SHUTDOWN, as xfstests cuts the power): from one instant
 on the file system takes nothing more, and what the kernel held in memory, data and journal, never reaches the disk.
@@ -12,6 +13,7 @@ helped.
 
 import contextlib
 import fcntl
+import itertools
 import os
 import signal
 import struct
@@ -22,15 +24,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 
 from stagectl.errors import StagectlError
 from stagectl.profile import load_profile
 from stagectl.record import read_run
 from stagectl.ring import RingReader
-from tests.faults.house import JOG_M_PER_S, House
-from tests.faults.judge import REST_M_PER_S
-from tests.faults.witness import ENABLED
+from tests.faults import real
+from tests.faults.house import House
+from tests.faults.judge import REST_M_PER_S, Record
+from tests.faults.kinds import CYCLE_S
+from tests.faults.witness import ENABLED, STOPPING
 from tests.service.daemon import servo_pid
 
 SHIPPED_HEARTBEAT_S = load_profile("single-axis").trip.heartbeat_s
@@ -39,7 +42,8 @@ _DISK_BYTES = 192 << 20
 _PATIENCE_S = 30.0
 _STANDS_S = 0.8  # heartbeat time and ramp, and as much again
 _TRIES = 3
-_SLOW_M_PER_S = 0.04  # 3 s in one direction
+_RECORDED = ("jogging", "moving", "homing", "identifying", "at rest", "stopping")  # phases of which there is a run
+_APART = 1000  # draws between two seeds: more than one ever needs
 _SHARED_MEMORY = Path("/dev/shm")
 _EXT4_IOC_SHUTDOWN, _NO_FLUSH = 0x8004_587D, 2  # linux/ext4.h
 
@@ -50,16 +54,12 @@ class NotHere(Exception):
 
 @dataclass(frozen=True)
 class Loss:
-    """Cycles of the last run that were on the bus, those of them that the files hold, and what could not be read."""
+    """Cycles on the bus, rows in the files, cycles that have none, and what could not be read."""
 
     syncs_count: int
     rows_count: int
+    cycles_lost: int
     unreadable: tuple[str, ...] = ()
-
-    @property
-    def cycles_lost(self) -> int:
-        """Cycles without a row; the one under way at the kill had its SYNC and not yet its row."""
-        return max(0, self.syncs_count - 1 - self.rows_count)
 
 
 @dataclass(frozen=True)
@@ -70,35 +70,73 @@ class Stopped:
     rest_s: float  # from then on, until the macro stood
 
 
+@dataclass(frozen=True)
+class Strike:
+    """Where a kill or a cut meets the stage, as a seed says."""
+
+    seed: int
+    scene: real.Scenario  # its fault is not used
+    supervisor_looks_away: bool  # while its servo is killed
+
+    @property
+    def text(self) -> str:
+        """The strike in words."""
+        scene, looks = self.scene, ", supervisor stopped first" if self.supervisor_looks_away else ""
+        return f"seed {self.seed}: {scene.profile}, {scene.phase}, after {scene.wait_s * 1e3:.0f} ms{looks}"
+
+
+def drawn(seed: int) -> Strike:
+    """Draw stage, phase, speed and instant as the runs with real processes do; phases without a run are passed over."""
+    scenes = map(real.drawn, itertools.count(_APART * seed))
+    scene = next(one for one in scenes if one.phase in _RECORDED)
+    return Strike(seed, scene, bool(np.random.default_rng([seed, 8]).random() < 0.5))
+
+
 def loss_of(runs: Path, seen: dict[str, np.ndarray], begun_t_ns: int, until_t_ns: int) -> Loss:
-    """Count SYNCs and rows of the newest run, from its first row until an instant; without a row from `begun_t_ns`."""
-    rows, bad = np.zeros(0, np.int64), []
-    for folder in sorted(runs.iterdir()):
-        if not (folder / "samples.arrow").exists():
-            continue
+    """Hold the rows of all runs against the SYNCs between two instants, in which an axis had power, each by itself."""
+    folders = [folder for folder in sorted(runs.iterdir()) if (folder / "samples.arrow").exists()]
+    record, bad = Record(folders), []
+    for folder in folders:
         try:
             read_run(folder)
-            t_ns = _t_ns_of(folder / "samples.arrow")
-        except (StagectlError, pa.ArrowException, OSError) as error:
+        except (StagectlError, OSError) as error:
             bad.append(f"{folder.name}: {error}")
-            continue
-        if t_ns.size and t_ns[0] >= begun_t_ns and (not rows.size or t_ns[0] > rows[0]):
-            rows = t_ns
-    rows = rows[rows <= until_t_ns]
-    first_t_ns = int(rows[0]) if rows.size else begun_t_ns
-    syncs = seen["sync_t_ns"]
-    return Loss(int(((syncs >= first_t_ns) & (syncs <= until_t_ns)).sum()), np.unique(rows).size, tuple(bad))
+    syncs, t_ns = seen["sync_t_ns"], record.columns["t_ns"]
+    at = np.searchsorted(seen["t_ns"], syncs).clip(max=seen["t_ns"].size - 1)
+    powered = np.isin(seen["states"][at], (ENABLED, *STOPPING)).any(axis=1)
+    owed = powered & (syncs >= begun_t_ns) & (syncs <= until_t_ns)
+    rows_count = int(((t_ns >= begun_t_ns) & (t_ns <= until_t_ns)).sum())
+    lost = int((unmatched(t_ns, syncs) & owed).sum())
+    return Loss(int(owed.sum()), rows_count, lost, (*record.unreadable, *bad))
 
 
-def _t_ns_of(path: Path) -> np.ndarray:
-    """Return the instants of the batches of a run that are whole."""
-    found = [np.zeros(0, np.int64)]
-    with pa.OSFile(str(path)) as file:
-        reader = pa.ipc.open_stream(file)
-        with contextlib.suppress(StopIteration, pa.ArrowInvalid):
-            while True:
-                found.append(reader.read_next_batch().column("t_ns").to_numpy())
-    return np.concatenate(found)
+def unmatched(rows_t_ns: np.ndarray, syncs_t_ns: np.ndarray) -> np.ndarray:
+    """Return which SYNCs have no row of their own: one begun before them, less than `HICCUP_S` ago, and not taken.
+
+    A host that holds the rig up has it hear two SYNCs at once, and one behind the next row. A row without a SYNC hides
+    a missing row no longer than `HICCUP_S`.
+    """
+    free: list[int] = []
+    alone, k, patience_ns = np.zeros(syncs_t_ns.size, bool), 0, round(1e9 * real.HICCUP_S)
+    rows = rows_t_ns.tolist()
+    for number, sync in enumerate(syncs_t_ns.tolist()):
+        while k < len(rows) and rows[k] <= sync:
+            free.append(rows[k])
+            k += 1
+        if free and sync - free[-1] <= patience_ns:
+            free.pop()
+        else:
+            alone[number] = True
+    return alone
+
+
+def counted_until(seen: dict[str, np.ndarray], killed_t_ns: int) -> int:
+    """Return until when a killed servo owes a row: its last SYNC, or before it where it may have died behind that.
+
+    It sends, then records; the time between is less than a cycle.
+    """
+    last_t_ns = int(seen["sync_t_ns"][-1])
+    return last_t_ns - 1 if last_t_ns > killed_t_ns - round(1e9 * CYCLE_S) else last_t_ns
 
 
 def stopped(seen: dict[str, np.ndarray], killed_t_ns: int) -> Stopped:
@@ -113,46 +151,66 @@ def stopped(seen: dict[str, np.ndarray], killed_t_ns: int) -> Stopped:
     return Stopped(1e-9 * float(begun_t_ns - killed_t_ns), 1e-9 * float(rest_t_ns - begun_t_ns))
 
 
-def _jogging(house: House, speed_m_per_s: float = JOG_M_PER_S) -> int:
-    """Have the stage jog; return an instant before its arming. A hiccup of the host gets it another try."""
+def _under_way(house: House, scene: real.Scenario) -> int:
+    """Bring the stage into the phase, wait; return an instant of its arming. A hiccup of the host gets it another try.
+
+    RuntimeError where it can't be had.
+    """
     house.daemon.state_is("idle")
     trouble = ""
     for _ in range(_TRIES):
-        house.find_rig()
-        begun_t_ns = house.t_ns()
         trouble = house.ready()
         house.find_rig()
-        if not trouble and house.set_off(speed_m_per_s):
-            return begun_t_ns
+        begun_t_ns = house.t_ns()
+        trouble = trouble or house.begin(scene.phase, scene.speed_m_per_s, scene.target_m)
+        if not trouble:
+            time.sleep(scene.wait_s)
+            fault = house.daemon.client.status().fault
+            if fault is None:
+                return begun_t_ns
+            trouble = fault.kind
         house.let_go()
-    raise RuntimeError(f"the scene could not be set: {trouble or 'it does not move'}")
+    raise RuntimeError(f"the scene could not be set: {trouble}")
 
 
-def after_servo_kill(folder: Path) -> tuple[Loss, Stopped]:
-    """Kill the servo of a stage that jogs, under the shipped heartbeat time; count what is kept when all has ended."""
-    house = House(folder, changes={"trip.heartbeat_s": SHIPPED_HEARTBEAT_S})
+def after_servo_kill(folder: Path, strike: Strike) -> tuple[Loss, Stopped | None]:
+    """Kill the servo, under the shipped heartbeat time; count what is kept when all has ended.
+
+    How the drives stopped is told where the macro followed commands, and the supervisor looked away: it takes the rig
+    along.
+    """
+    scene = strike.scene
+    house = House(folder, profile=scene.profile, changes={"trip.heartbeat_s": SHIPPED_HEARTBEAT_S})
     try:
-        begun_t_ns = _jogging(house)
+        begun_t_ns = _under_way(house, scene)
         supervisor, servo = house.daemon.process.pid, servo_pid(house.daemon)
-        os.kill(supervisor, signal.SIGSTOP)  # with it the rig would go, before the drives have stopped the stage
-        killed_t_ns = house.t_ns()
+        if strike.supervisor_looks_away:
+            os.kill(supervisor, signal.SIGSTOP)
+        seen, killed_t_ns = house.look_back(), house.t_ns()
         os.kill(servo, signal.SIGKILL)
         house.let_go()
-        time.sleep(_STANDS_S)
-        seen = house.look_back()
-        os.kill(supervisor, signal.SIGCONT)
-        house.daemon.state_is("fault")
+        if strike.supervisor_looks_away:
+            time.sleep(_STANDS_S)
+            seen = house.look_back()
+            os.kill(supervisor, signal.SIGCONT)
+        else:
+            with contextlib.suppress(StagectlError, OSError):  # then what was seen just before the kill has to do
+                seen = house.look_back()
+        house.daemon.state_is("fault", "idle")
         _until_closed(house.daemon.runs)
-        return loss_of(house.daemon.runs, seen, begun_t_ns, int(seen["t_ns"][-1])), stopped(seen, killed_t_ns)
+        loss = loss_of(house.daemon.runs, seen, begun_t_ns, counted_until(seen, killed_t_ns))
+        at = min(int(np.searchsorted(seen["t_ns"], killed_t_ns)), seen["t_ns"].size - 1)
+        follows = strike.supervisor_looks_away and seen["states"][at, 0] == ENABLED
+        return loss, stopped(seen, killed_t_ns) if follows else None
     finally:
         house.close()
 
 
-def after_supervisor_kill(folder: Path) -> Loss:
-    """Kill the supervisor of a stage that jogs; the servo stops it, then saves the rows."""
-    house = House(folder)
+def after_supervisor_kill(folder: Path, strike: Strike) -> Loss:
+    """Kill the supervisor; the servo stops the stage, then saves the rows."""
+    house = House(folder, profile=strike.scene.profile)
     try:
-        begun_t_ns = _jogging(house)
+        begun_t_ns = _under_way(house, strike.scene)
         servo = servo_pid(house.daemon)
         house.daemon.process.kill()
         house.daemon.process.wait()
@@ -164,6 +222,25 @@ def after_supervisor_kill(folder: Path) -> Loss:
         with contextlib.suppress(StagectlError):  # the rig stays for five seconds
             house.look_back()
         return loss_of(house.daemon.runs, house.seen, begun_t_ns, int(house.seen["t_ns"][-1]))
+    finally:
+        house.close()
+
+
+def after_both_killed(folder: Path, strike: Strike) -> Loss:
+    """Kill servo and supervisor; the next service writes what their shared memory holds."""
+    house = House(folder, profile=strike.scene.profile)
+    try:
+        begun_t_ns = _under_way(house, strike.scene)
+        servo, killed_t_ns = servo_pid(house.daemon), house.t_ns()
+        os.kill(servo, signal.SIGKILL)
+        house.daemon.process.kill()
+        house.daemon.process.wait()
+        seen = house.look_back()
+        house.daemon.start()
+        house.daemon.client.lease_token = ""
+        house.daemon.state_is("idle", "fault")
+        _until_closed(house.daemon.runs)
+        return loss_of(house.daemon.runs, seen, begun_t_ns, counted_until(seen, killed_t_ns))
     finally:
         house.close()
 
@@ -184,18 +261,17 @@ def _until_closed(runs: Path) -> None:
         time.sleep(0.1)
 
 
-def after_power_cut(folder: Path, jogged_s: float = 0.3) -> Loss:
-    """Take the disk away under a stage that jogs, forget its memory, and count what is left on the disk.
+def after_power_cut(folder: Path, strike: Strike) -> Loss:
+    """Take the disk away under a stage that works, forget its memory, and count what is left on the disk.
 
     Raises NotHere where no disk can be mounted.
     """
     folder.mkdir(parents=True)
     _make_disk(folder / "image")
     with _disk(folder / "image", folder / "disk") as disk:
-        house = House(folder / "house", runs=disk / "runs")
+        house = House(folder / "house", disk / "runs", strike.scene.profile)
         try:
-            begun_t_ns = _jogging(house, _SLOW_M_PER_S)
-            time.sleep(jogged_s)
+            begun_t_ns = _under_way(house, strike.scene)
             servo = servo_pid(house.daemon)
             cut_t_ns = house.t_ns()
             _cut(disk)

@@ -8,12 +8,15 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from bench import service, service_batch, service_processes
+from bench.figure import judged
 from bench.journal import APART, Journal, beside_figures, sources_hash
 from bench.mutation import mutants, trial, uncompiled
 from bench.service_mutants import MODULES, equivalent
+from bench.service_processes import COUNT, COUNT_FULL, FULL_LOSS_SEEDS, LOSS_SEEDS
 from tests.faults import losses, real
 from tests.faults.judge import BACK, LOST, TRAVEL, _bound_m
 from tests.faults.mechanics import mechanics_of
@@ -27,6 +30,7 @@ LIMIT = 3
 
 def step(a, b):
     """Say which is more."""
+    print(a)
     if a < b and not a == LIMIT:
         return a + b
     return max(a, b)
@@ -128,19 +132,69 @@ def test_the_seeded_part_has_every_process_killed_and_stopped_in_every_motion():
     assert len({one.profile for one in drawn}) == 2
 
 
-def test_rows_are_held_against_the_syncs_of_the_newest_run(tmp_path, monkeypatch):
-    """Two runs; the second has 40 rows, of which 3 in the middle are missing, and 2 SYNCs come behind its last."""
-    t_ns = np.arange(100) * 1_000_000
-    files = {"1": t_ns[:20], "2": np.delete(t_ns[50:90], [10, 11, 12])}
-    for name in files:
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "samples.arrow").write_bytes(b"")
+def test_a_kill_and_a_cut_are_drawn_from_a_seed_in_every_phase_that_is_recorded():
+    every = {name: [losses.drawn(seed) for seed in seeds] for name, seeds in FULL_LOSS_SEEDS.items()}
+    assert [one.text for one in every["servo"]] == [losses.drawn(seed).text for seed in FULL_LOSS_SEEDS["servo"]]
+    drawn = [one for strikes in every.values() for one in strikes]
+    assert {one.scene.phase for one in drawn} >= {*MOTIONS, "at rest"}
+    assert {one.supervisor_looks_away for one in every["servo"]} == {True, False}
+    assert all(len(strikes) >= 10 for strikes in every.values())
+    assert all(len({one.scene.profile for one in strikes}) == 2 for strikes in every.values())
+    few = {name: [losses.drawn(seed) for seed in seeds] for name, seeds in LOSS_SEEDS.items()}
+    assert any(one.supervisor_looks_away and one.scene.phase == "jogging" for one in few["servo"])  # told by the rig
+    assert any(one.scene.profile == "oled-printer" for one in few["power"])
+    assert all(one.scene.phase in MOTIONS for strikes in few.values() for one in strikes)
+
+
+def loss_of(folder, rows_ns, syncs_ns, until_ns=99_000_000):
+    """Held against the SYNCs of 0.1 s with power, by two runs, the first of them from before."""
+    for name, t_ns in {"1": np.zeros(0, np.int64), "2": rows_ns}.items():
+        (folder / name).mkdir(parents=True)
+        table = pa.table(
+            {"t_ns": t_ns, "run_phase": t_ns * 0, "stop": t_ns * 0, "setpoint_velocity_m_per_s": t_ns * 0.0}
+        )
+        with pa.ipc.new_stream(str(folder / name / "samples.arrow"), table.schema) as stream:
+            stream.write_table(table)
+    seen = {"t_ns": np.arange(102) * 1_000_000, "states": np.full((102, 2), ENABLED), "sync_t_ns": syncs_ns}
+    return losses.loss_of(folder, seen, -1, until_ns)
+
+
+@pytest.mark.parametrize(
+    ("gone", "silent", "lost"),
+    [
+        ([], [], 0),
+        ([40, 41, 42], [], 3),
+        (list(range(60, 80)), list(range(10, 30)), 20),  # rows without a SYNC hide none that is missing
+        ([99], [], 1),  # the last one is not forgiven
+        ([98, 99], [], 2),
+        ([0, 1, 2], [], 3),  # nor is the head
+    ],
+)
+def test_every_sync_is_owed_a_row_of_its_own(tmp_path, monkeypatch, gone, silent, lost):
     monkeypatch.setattr(losses, "read_run", lambda folder: None)
-    monkeypatch.setattr(losses, "_t_ns_of", lambda path: files[path.parent.name])
-    seen = {"sync_t_ns": t_ns[:92] + 500_000}
-    found = losses.loss_of(tmp_path, seen, 0, int(t_ns[-1]))
-    assert (found.syncs_count, found.rows_count, found.cycles_lost) == (42, 37, 4)
-    assert losses.loss_of(tmp_path, seen, int(t_ns[95]), int(t_ns[-1])).rows_count == 0
+    ms = np.arange(100) * 1_000_000
+    found = loss_of(tmp_path, np.delete(ms, gone), np.delete(ms + 400_000, silent), 100_000_000)
+    assert found.cycles_lost == lost
+    assert found.unreadable == ()
+
+
+def test_a_rig_that_hears_a_sync_late_has_lost_none():
+    """The second SYNC of two comes behind the next row, and then nothing for two cycles."""
+    rows = np.array([0, 1, 3, 4]) * 1_000_000
+    syncs = np.array([1_200_000, 1_400_000, 3_400_000, 4_400_000])
+    assert not losses.unmatched(rows, syncs).any()
+    assert losses.unmatched(np.delete(rows, 2), syncs).tolist() == [False, False, True, False]
+
+
+def test_a_run_that_cant_be_read_is_counted(tmp_path):
+    found = loss_of(tmp_path, np.arange(100) * 1_000_000, np.arange(100) * 1_000_000 + 400_000)
+    assert len(found.unreadable) == 2  # they have no manifest
+
+
+def test_only_a_cycle_that_may_have_been_under_way_is_owed_no_row():
+    seen = {"sync_t_ns": np.arange(100) * 1_000_000 + 400_000}
+    assert losses.counted_until(seen, 99_900_000) == 99_399_999
+    assert losses.counted_until(seen, 100_500_000) == 99_400_000
 
 
 def test_when_the_drives_stopped_is_read_from_the_rig_s_log():
@@ -160,10 +214,39 @@ def test_when_the_drives_stopped_is_read_from_the_rig_s_log():
 
 def test_the_last_figure_is_how_long_all_parts_took(monkeypatch):
     monkeypatch.setattr(service, "PARTS", {"soak": lambda **_: iter(()), "batch": lambda **_: iter(())})
-    (figure,) = service.figures(full=False, say=lambda text: None)
+    ended, figure = service.figures(full=False, say=lambda text: None)
+    assert (ended.value, ended.holds) == (2, True)
     assert (figure.figure, figure.bar, figure.holds) == ("all parts together", "<= 900 s", True)
     assert figure.reason == "soak 0 s, batch 0 s"
-    assert list(service.figures(full=False, say=lambda text: None, part="soak")) == []
+    assert len(list(service.figures(full=False, say=lambda text: None, part="soak"))) == 1
+
+
+def test_a_part_that_breaks_takes_no_other_along_and_is_a_missed_bar(monkeypatch):
+    def breaks(**_):
+        yield judged(service_batch.COUNT, 60)
+        raise RuntimeError("the servo was made anew")
+
+    monkeypatch.setattr(service, "PARTS", {"soak": breaks, "batch": lambda **_: iter([judged(COUNT, 10)])})
+    first, second, ended, _ = service.figures(full=False, say=lambda text: None)
+    assert (first.holds, second.holds) == (True, True)
+    assert (ended.value, ended.holds) == (1, False)
+    assert ended.reason == "soak: RuntimeError: the servo was made anew"
+
+
+def test_too_few_runs_are_a_missed_bar():
+    entries = [entry("EMCY")] * 59
+    (figure, *_) = service_batch.of_entries(entries, list(range(59)), service_batch.COUNT)
+    assert figure.holds is False
+    assert service_batch.COUNT_FULL.limit == 900
+    assert (COUNT.limit, COUNT_FULL.limit) == (10, 100)
+
+
+def test_cycles_lost_with_real_processes_are_a_missed_bar(monkeypatch):
+    scenario = real.drawn(0)
+    lost = real.RealResult(0, scenario, "LinkError", ((LOST, "7 cycles on the bus have no row"),), 0.0, 0.0, 1.0)
+    monkeypatch.setattr(real, "run", lambda seed, folder: lost)
+    found = {one.figure: one for one in service_processes.figures(full=False, say=lambda text: None, seeds=[0])}
+    assert found[f"real processes: {LOST}"].holds is False
 
 
 def test_parts_are_named():
@@ -183,6 +266,7 @@ def test_mutants_are_small_changes_that_differ_from_the_code_and_from_each_other
     assert len(keys) == len(made)
     assert {
         "module: in LIMIT = 3: 3 -> 4",
+        "step: print(a) -> nothing",
         "step: a < b -> a <= b",
         "step: a < b and (not a == LIMIT) -> a < b or not a == LIMIT",
         "step: not a == LIMIT -> a == LIMIT",
