@@ -6,7 +6,7 @@
 #   deploy/install.sh uninstall [--keep FOLDER] [--yes]   leave nothing; profiles and runs go to FOLDER where one is given
 #
 #   --wheels FOLDER   install the Python packages from there: a stage PC has no internet
-#   --yes             don't ask before profiles and runs are deleted
+#   --yes             don't ask before profiles and runs are deleted; needed where there is no terminal to ask on
 #   DESTDIR           install below this folder instead of /: files only, no users, no Python environment, no systemd
 #   PYTHON            the interpreter of the installation (default: python3)
 #
@@ -37,6 +37,7 @@ SHARED_FOLDERS=(
   /usr/local/lib/sysusers.d /usr/local/lib/tmpfiles.d /usr/local/lib/modules-load.d
 )
 DATA_FOLDERS=(/etc/stagectl /var/lib/stagectl /var/cache/stagectl)
+DROP_INS=/etc/systemd/system/stagectl.service.d
 
 say() { printf '%s\n' "$*"; }
 refuse() {
@@ -174,12 +175,23 @@ count_of() { # FOLDER, find's tests: how many
   { find "$DESTDIR$1" -mindepth 1 -maxdepth 1 "${@:2}" 2>/dev/null || true; } | wc -l
 }
 
+check_outlasts() { # KEEP: what is copied there is still there after the uninstall
+  local folder doomed
+  for folder in "$PROGRAM" "${DATA_FOLDERS[@]}" "$DROP_INS"; do
+    doomed=$(realpath -m "$DESTDIR$folder")
+    [[ $1/ != "$doomed"/* ]] || refuse "--keep $1: uninstall removes $doomed; give a folder outside it; nothing was done"
+  done
+}
+
 uninstall() { # KEEP YES
   local keep=$1 runs_count profiles_count answer entry folder
   staged || [[ $EUID -eq 0 ]] || refuse "only root may uninstall below /; use sudo"
+  [[ -z $keep ]] || check_outlasts "$keep"
   runs_count=$(count_of /var/lib/stagectl/runs -type d)
   profiles_count=$(count_of /etc/stagectl -name '*.toml')
-  if [[ -z $keep && -z $2 && -t 0 && $((runs_count + profiles_count)) -gt 0 ]]; then
+  if [[ -z $keep && -z $2 && $((runs_count + profiles_count)) -gt 0 ]]; then
+    [[ -t 0 ]] || refuse "$runs_count runs and $profiles_count profiles would be deleted, and there is no terminal to ask" \
+      "on: --keep FOLDER keeps them, --yes deletes them; nothing was done"
     read -r -p "delete $runs_count runs and $profiles_count profiles? --keep FOLDER would keep them [yes/no] " answer
     [[ $answer == yes ]] || refuse "nothing was done"
   fi
@@ -196,7 +208,7 @@ uninstall() { # KEEP YES
     say "profiles and runs are in $keep"
   fi
   for entry in "${FILES[@]}"; do rm -f "$DESTDIR${entry#* }"; done
-  rm -rf "$DESTDIR$PROGRAM" "$DESTDIR/usr/local/bin/stagectl" "$DESTDIR/etc/systemd/system/stagectl.service.d"
+  rm -rf "$DESTDIR$PROGRAM" "$DESTDIR/usr/local/bin/stagectl" "$DESTDIR$DROP_INS"
   for folder in "${DATA_FOLDERS[@]}"; do rm -rf "$DESTDIR${folder:?}"; done
   for folder in "${SHARED_FOLDERS[@]}"; do rmdir "$DESTDIR$folder" 2>/dev/null || true; done
   if ! staged; then

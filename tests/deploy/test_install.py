@@ -150,7 +150,7 @@ def test_an_uninstall_leaves_nothing(host):
     dropin = host.root / "etc/systemd/system/stagectl.service.d/override.conf"
     dropin.parent.mkdir(parents=True)
     dropin.write_text("[Service]\nCPUAffinity=0 3\n")
-    host.does("uninstall")
+    host.does("uninstall", "--yes")
     after = host.content()
     assert {name for name in after if name not in before} == {"etc/systemd", "etc/systemd/system"}  # the test's own
     assert {name: after[name] for name in before} == before
@@ -176,6 +176,32 @@ def test_an_uninstall_can_keep_profiles_and_runs(host, tmp_path):
     kept = {str(path.relative_to(tmp_path / "kept")) for path in (tmp_path / "kept").rglob("*") if path.is_file()}
     assert {"etc-stagectl/my-stage.toml", "lib-stagectl/runs/one/events.jsonl"} <= kept
     assert not (host.root / "var/lib/stagectl").exists()
+
+
+@pytest.mark.parametrize(
+    "place", ["opt/stagectl/kept", "var/cache/stagectl", "etc/stagectl/../stagectl/kept", "link/kept"]
+)
+def test_what_is_to_be_kept_is_not_put_where_an_uninstall_removes_it(host, place):
+    host.does("install")
+    (host.root / "var/lib/stagectl/runs/one").mkdir()
+    (host.root / "link").symlink_to(host.root / "var/lib/stagectl")
+    before = host.content()
+    refused = host.run("uninstall", "--keep", str(host.root / place))
+    assert refused.returncode == 1
+    assert "give a folder outside it" in refused.stderr
+    assert host.content() == before
+
+
+@pytest.mark.parametrize("kept", ["etc/stagectl/my-stage.toml", "var/lib/stagectl/runs/one"])
+def test_an_uninstall_that_can_ask_nobody_deletes_no_run_and_no_profile(host, kept):
+    host.does("install")
+    (host.root / kept).mkdir()
+    before = host.content()
+    refused = host.run("uninstall")
+    assert refused.returncode == 1
+    assert "no terminal to ask" in refused.stderr
+    assert "--keep FOLDER" in refused.stderr
+    assert host.content() == before
 
 
 @pytest.mark.parametrize("arguments", [[], ["remove"], ["install", "--wheel", "x"], ["install", "--wheels"]])

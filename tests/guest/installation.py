@@ -127,7 +127,7 @@ def removed(before: set[str]) -> None:
     check("it stops without a complaint", unit("Result") == "success", unit("Result"))
     check("nothing of it runs", not pids("."), pids("."))
     rig.stop()
-    shell(INSTALL, "uninstall")
+    shell(INSTALL, "uninstall", "--yes")
     after = everything()
     check("uninstall leaves nothing", not after - before, sorted(after - before)[:20])
     check("and takes nothing of others", not before - after, sorted(before - after)[:20])
