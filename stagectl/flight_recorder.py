@@ -86,6 +86,11 @@ class FlightRecorder:
         return None if self._run is None else self._run.folder
 
     @property
+    def trigger_soon(self) -> str:
+        """What the run was begun by that rows go to soon: the next one's where one is being made, else `trigger`."""
+        return self.trigger if self._next is None else self._next.trigger
+
+    @property
     def run_rows_count(self) -> int:
         """Rows of the run under way."""
         return 0 if self._run is None else self._run.rows_count
@@ -116,7 +121,7 @@ class FlightRecorder:
         while self._events and self._events[0][2] < self.rows_count - self._rows_held_count:
             self._events.popleft()  # of rows that are gone
         with self._policy():
-            if self._run is not None and self._run.rows_count >= self._run_rows_limit_count:
+            if self._run is not None and self._next is None and self._run.rows_count >= self._run_rows_limit_count:
                 self.go_on_as(self._run_name, self.trigger)
             self._take_next()
             if self._run is not None:

@@ -41,6 +41,7 @@ class Recording:
         self._asked: messages.SetTrigger | None = None
         self._watch: TriggerWatch | None = None
         self._left_count = 0
+        self._name_after_motion = ""  # of the run that was asked for while a motion's was under way
         self._window: tuple[int, int] | None = None  # rows of the session, the end of which is still to come
 
     def factory(self, profile: Profile) -> Callable[[Path, dict[str, Any]], FlightRecorder]:
@@ -82,9 +83,14 @@ class Recording:
             self._log.say("run", "begun", run=flight.run_folder.name, trigger=trigger)
 
     def end(self, trigger: str, stop: str, text: str) -> None:
-        """End the run under way where `trigger` began it."""
+        """End the run under way where `trigger` began it, or would begin what it is about to go on in."""
         flight = self._recorder
-        if flight is None or flight.run_folder is None or flight.trigger != trigger:
+        if flight is None or trigger not in (flight.trigger, flight.trigger_soon):
+            return
+        if trigger == ARM and self._name_after_motion:
+            name, self._name_after_motion = self._name_after_motion, ""
+            flight.go_on_as(f"service-{name}", REQUEST, {"stop": stop, "text": text})
+        if flight.run_folder is None or flight.trigger_soon != trigger:
             return
         try:
             folder = flight.end_run({"stop": stop, "text": text})
@@ -94,19 +100,31 @@ class Recording:
         self._log.say("run", "ended", run=folder.name if folder is not None else "", trigger=trigger)
 
     def begin_on_request(self, name: str) -> None:
-        """Begin a run that a client asked for, where none is under way; the stage may move meanwhile."""
+        """Begin a run that a client asked for, behind a motion's where that is under way; the stage may move meanwhile.
+
+        Where another is under way that was asked for, or the session's, that one has the rows already.
+        """
         flight = self._recorder
-        if flight is not None and flight.run_folder is None:
+        if flight is None:
+            return
+        if flight.run_folder is None:
             flight.go_on_as(f"service-{name}", REQUEST)
+            return
+        if flight.trigger_soon == ARM:
+            self._name_after_motion = name
+            self._log.say("run", f"{name} begins when this one ends", run=flight.run_folder.name, trigger=ARM)
+        else:
+            self._log.say("run", f"{name}: this one goes on", run=flight.run_folder.name, trigger=flight.trigger)
 
     def end_on_request(self, powered: bool) -> None:
         """End the run that a client asked for; a motion that is under way goes on being recorded, in its own."""
         flight, stop, text = self._recorder, Stop.OPERATOR.name, STOP_TEXT[Stop.OPERATOR]
+        self._name_after_motion = ""
         if flight is None:
             return
         if flight.run_folder is None:
             flight.end_run()  # it is not there yet
-        elif powered and flight.trigger == REQUEST:
+        elif powered and flight.trigger_soon == REQUEST:
             flight.go_on_as(f"service-{ARM}", ARM, {"stop": stop, "text": text})
         else:
             self.end(REQUEST, stop, text)
@@ -166,6 +184,7 @@ class Recording:
     def forget(self) -> None:
         """The session is over."""
         self._recorder = self._window = None
+        self._name_after_motion = ""
 
     def discard(self, session: Path) -> None:
         """Remove the folder of a session that did not come about, where it holds no row."""

@@ -561,6 +561,84 @@ def test_a_run_that_was_asked_for_ends_also_before_it_is_there(tmp_path):
     assert [folder.name for folder in run_folders(tmp_path)] == [session.folder.name]
 
 
+def test_a_run_that_was_ended_does_not_go_on_because_it_is_long(tmp_path):
+    session = flight(tmp_path, limit_count=500)
+    session.go_on_as("asked", "request")
+    first = record_until_it_goes_on(session, 0)
+    session.append(rows_from(first, 500))
+    session.go_on_as("arm", "arm", {"stop": "OPERATOR"})
+    end = record_until_it_goes_on(session, first + 500)
+    assert session.trigger == "arm"
+    session.close()
+    assert read_run(*tmp_path.glob("*-arm")).rows["cycle"][-1] == end - 1
+
+
+def slow_folders(bench, monkeypatch) -> threading.Event:
+    """Have the thread that makes folders wait until what is returned is set."""
+    made = threading.Event()
+    reserve_now = bench.loop._recording._recorder._reserve
+
+    def slowly(name):
+        assert made.wait(20.0), "the stage's thread waits for the disk"
+        return reserve_now(name)
+
+    monkeypatch.setattr(bench.loop._recording._recorder, "_reserve", slowly)
+    return made
+
+
+def disarm(bench) -> None:
+    bench.desk.ask_to_stop("test")
+    bench.until(lambda: bench.desk.stop_asked is False)
+    bench.loop.step()
+    assert bench.status.state == "idle"
+
+
+def test_a_run_that_is_ended_as_the_motion_ends_does_not_go_on_at_rest(bench, monkeypatch):
+    bench.take()
+    bench.do("home", messages.Home())
+    bench.desk.ask_to_record("watch")
+    bench.until(lambda: bench.status.recording.run != "")
+    bench.do("arm", messages.Arm())
+    made = slow_folders(bench, monkeypatch)
+    bench.desk.ask_to_record("")
+    bench.loop.step()
+    disarm(bench)
+    made.set()
+    for _ in range(50):
+        bench.loop.step()
+        time.sleep(0.001)
+    assert (bench.status.recording.run, bench.status.recording.trigger) == ("", "")
+    (asked,) = runs_of(bench, "watch")
+    assert read_run(asked).manifest["record"]["state"] == "closed"
+    assert runs_of(bench, "arm") == []
+
+
+@pytest.mark.parametrize("ended_before", [False, True])
+def test_a_run_that_is_asked_for_in_a_motion_begins_behind_it(bench, ended_before):
+    bench.take()
+    bench.do("home", messages.Home())
+    bench.do("arm", messages.Arm())
+    bench.desk.ask_to_record("watch")
+    bench.loop.step()
+    assert bench.status.recording.trigger == "arm"
+    if ended_before:
+        bench.desk.ask_to_record("")
+        bench.loop.step()
+    disarm(bench)
+    if ended_before:
+        assert bench.status.recording.run == ""
+        assert runs_of(bench, "watch") == []
+        return
+    bench.until(lambda: bench.status.recording.trigger == "request")
+    bench.loop.step()
+    bench.desk.ask_to_record("")
+    bench.until(lambda: bench.status.recording.run == "")
+    (asked,), (motion,) = runs_of(bench, "watch"), runs_of(bench, "arm")
+    cycles = np.concatenate([read_run(motion).rows, read_run(asked).rows])["cycle"]
+    assert np.all(np.diff(cycles) == 1)
+    assert read_run(motion).manifest["end"]["stop"] == "OPERATOR"
+
+
 def test_an_arming_finds_the_run_that_was_asked_for(tmp_path):
     session = flight(tmp_path)
     session.go_on_as("asked", "request")
