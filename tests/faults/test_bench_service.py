@@ -186,6 +186,15 @@ def test_a_rig_that_hears_a_sync_late_has_lost_none():
     assert losses.unmatched(np.delete(rows, 2), syncs).tolist() == [False, False, True, False]
 
 
+@pytest.mark.parametrize("missing", [(), (30,), (5, 60, 61)])
+def test_what_a_rig_hears_late_and_at_once_is_no_lost_cycle_and_hides_none(missing):
+    """It stood still for 50 ms, and heard 50 SYNCs then."""
+    rows = np.arange(200) * 1_000_000
+    syncs = rows + 400_000
+    syncs[10:60] = syncs[59]
+    assert losses.unmatched(np.delete(rows, missing), syncs).sum() == len(missing)
+
+
 def test_a_run_that_cant_be_read_is_counted(tmp_path):
     found = loss_of(tmp_path, np.arange(100) * 1_000_000, np.arange(100) * 1_000_000 + 400_000)
     assert len(found.unreadable) == 2  # they have no manifest
