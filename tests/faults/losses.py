@@ -38,7 +38,6 @@ from tests.service.daemon import servo_pid
 
 SHIPPED_HEARTBEAT_S = load_profile("single-axis").trip.heartbeat_s
 
-BURST_COUNT = 100  # SYNCs that a rig may hear at once
 _DISK_BYTES = 192 << 20
 _PATIENCE_S = 30.0
 _STANDS_S = 0.8  # heartbeat time and ramp, and as much again
@@ -96,7 +95,7 @@ def drawn(seed: int) -> Strike:
 def loss_of(runs: Path, seen: dict[str, np.ndarray], begun_t_ns: int, until_t_ns: int) -> Loss:
     """Hold the rows of all runs against the SYNCs between two instants, in which an axis had power, each by itself."""
     folders = [folder for folder in sorted(runs.iterdir()) if (folder / "samples.arrow").exists()]
-    # Of a file that the disk got no byte of (a session's, which has no rows) only the product's reader can say anything.
+    # A file that the disk got no byte of (a session's, which has no rows) is read by the product's reader only.
     record, bad = Record([folder for folder in folders if (folder / "samples.arrow").stat().st_size]), []
     for folder in folders:
         try:
@@ -115,18 +114,20 @@ def loss_of(runs: Path, seen: dict[str, np.ndarray], begun_t_ns: int, until_t_ns
 def unmatched(rows_t_ns: np.ndarray, syncs_t_ns: np.ndarray) -> np.ndarray:
     """Return which SYNCs have no row of their own: one begun before them, not long ago, and not taken.
 
-    A host that holds the rig up has it hear SYNCs late, and many at once: as late as the longest silence among the last
-    `BURST_COUNT`. A row without a SYNC hides a missing row no longer than that, and `HICCUP_S`.
+    A host that holds the rig up has it hear many SYNCs at once, up to as late as the silence before them. A row without
+    a SYNC hides a missing row no longer than `HICCUP_S`, and that silence.
     """
     free: list[int] = []
     alone, k = np.zeros(syncs_t_ns.size, bool), 0
-    silences_ns = np.diff(syncs_t_ns, prepend=syncs_t_ns[:1])
+    spans_ns = np.diff(syncs_t_ns, prepend=syncs_t_ns[:1], append=syncs_t_ns[-1:]).tolist()
+    dense_ns, silence_ns = 0.5e9 * CYCLE_S, 0
     rows = rows_t_ns.tolist()
     for number, sync in enumerate(syncs_t_ns.tolist()):
         while k < len(rows) and rows[k] <= sync:
             free.append(rows[k])
             k += 1
-        silence_ns = int(silences_ns[max(number - BURST_COUNT, 0) : number + 1].max())
+        if spans_ns[number] >= dense_ns:
+            silence_ns = spans_ns[number] if spans_ns[number + 1] < dense_ns else 0
         if free and sync - free[-1] <= silence_ns + round(1e9 * real.HICCUP_S):
             free.pop()
         else:

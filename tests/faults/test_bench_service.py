@@ -150,9 +150,8 @@ def loss_of(folder, rows_ns, syncs_ns, until_ns=99_000_000):
     """Held against the SYNCs of 0.1 s with power, by two runs, the first of them from before."""
     for name, t_ns in {"1": np.zeros(0, np.int64), "2": rows_ns}.items():
         (folder / name).mkdir(parents=True)
-        table = pa.table(
-            {"t_ns": t_ns, "run_phase": t_ns * 0, "stop": t_ns * 0, "setpoint_velocity_m_per_s": t_ns * 0.0}
-        )
+        setpoints = {f"setpoint_{name}": t_ns * 0.0 for name in ("position_m", "velocity_m_per_s")}
+        table = pa.table({"t_ns": t_ns, "run_phase": t_ns * 0, "stop": t_ns * 0, **setpoints})
         with pa.ipc.new_stream(str(folder / name / "samples.arrow"), table.schema) as stream:
             stream.write_table(table)
     seen = {"t_ns": np.arange(102) * 1_000_000, "states": np.full((102, 2), ENABLED), "sync_t_ns": syncs_ns}
