@@ -275,7 +275,7 @@ def identify(
     """Identify the backlash: the micro sweeps over both edges of the joint, pressing with a few newtons."""
 
     def work(voice: "Voice") -> "Answer":
-        if backend != "plant" and commands.remote.served(socket, in_place):
+        if backend != "plant" and commands.remote.served(socket, lease, in_place):
             body = commands.remote.checked("Identify", frequency_hz=frequency_hz, duration_s=duration_s)
             return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "identify", body)
         return commands.motion.identify(voice, profile, backend, runs, seed, frequency_hz, duration_s)
@@ -308,7 +308,7 @@ def jog(
     def work(voice: "Voice") -> "Answer":
         if distance_m is None:
             return commands.jog_keys.jog(voice, socket, lease, velocity_m_per_s)
-        if commands.remote.served(socket, in_place):
+        if commands.remote.served(socket, lease, in_place):
             body = commands.remote.checked("JogBy", distance_m=distance_m, law=law)
             return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "jog", body)
         return commands.motion.jog(voice, profile, backend, runs, seed, distance_m, law)
@@ -332,7 +332,7 @@ def move(
     """Arm, home where needed, move to a position, come to rest."""
 
     def work(voice: "Voice") -> "Answer":
-        if commands.remote.served(socket, in_place):
+        if commands.remote.served(socket, lease, in_place):
             body = commands.remote.checked("Move", target_m=target_m, law=law)
             return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "move", body)
         shape = commands.planning.Shape(None, None, None, None, None, None, None, target_m)
@@ -355,7 +355,7 @@ def home(
     """Home: the macro on its drive's index, then the micro on both edges of the joint."""
 
     def work(voice: "Voice") -> "Answer":
-        if commands.remote.served(socket, in_place):
+        if commands.remote.served(socket, lease, in_place):
             body = commands.remote.checked("Home")
             return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "home", body)
         return commands.motion.home(voice, profile, backend, runs, seed)

@@ -25,9 +25,23 @@ _POLL_S, _LOOK_S, _HEED_S = 0.2, 0.05, 3.0
 _FINISHED = "FINISHED"
 
 
-def served(socket: Path | None, in_place: bool) -> bool:
-    """Tell whether a command goes through a service: one answers, and nobody asked for another way."""
-    return not in_place and is_served(socket or default_socket())
+def served(socket: Path | None, lease: str | None, in_place: bool) -> bool:
+    """Tell whether a command goes through a service: one answers, and nobody asked for another way.
+
+    LinkError where a socket or a lease was named and nobody answers: another stage, in place, is not what was meant.
+    """
+    if in_place:
+        return False
+    path = socket or default_socket()
+    if is_served(path):
+        return True
+    if socket is not None or lease:
+        named = f"socket {socket}" if socket is not None else "a lease"
+        raise LinkError(
+            f"{named} was named, and no service answers at {path}; start it (stagectl serve), or ask for a stage of "
+            "this command's own with --in-place"
+        )
+    return False
 
 
 def checked(kind: str, /, **values: object) -> BaseModel:

@@ -160,6 +160,19 @@ def test_without_a_service_there_is_nothing_to_ask(call, monkeypatch, tmp_path):
         assert "is `stagectl serve` running?" in answer["error"]["message"]
 
 
+@pytest.mark.parametrize("named", [["--socket", "none"], ["--lease", "abc"]])
+@pytest.mark.parametrize(
+    "command", [["move", "--target-m", "0.01"], ["jog", "--distance-m", "0.01"], ["home"], ["identify"]]
+)
+def test_what_was_meant_for_a_service_that_is_gone_moves_nothing_else(named, command, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("STAGECTL_SOCKET", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert cli.main([*command, *named, "--runs", str(tmp_path / "runs"), "--json"]) == 3
+    assert "no service answers at" in capsys.readouterr().out
+    assert not (tmp_path / "runs").exists()
+
+
 def keys_jog(idle):
     """Start `jog --keys` at a terminal of its own: (the terminal's other end, the process)."""
     leader, follower = pty.openpty()
