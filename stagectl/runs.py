@@ -78,7 +78,8 @@ class RunSummary:
 
     folder: Path
     state: str
-    """closed | recovered | recording | crashed (its recorder died) | damaged (`note` says how)."""
+    """closed | recovered | recording | crashed (its recorder died) | damaged (`note` says how) | session (of a service
+    that runs: it holds events, and rows only where a servo died)."""
     rows_count: int
     duration_s: float
     profile: str
@@ -117,7 +118,8 @@ def summary(folder: Path, count_under_way: bool = True) -> RunSummary:
         stop, text = ending(manifest)
         note = ""
         if state == "recording":
-            state = "recording" if is_held(folder / SAMPLES) else "crashed"
+            under_way = "session" if manifest.get("trigger") == "session" else "recording"
+            state = under_way if is_held(folder / SAMPLES) else "crashed"
             count = 0
             if (count_under_way or state == "crashed") and (folder / SAMPLES).exists():
                 count, first_t_ns, last_t_ns = recorded_extent(folder)

@@ -16,7 +16,7 @@ from stagectl.signals import Stop, stop_sentence
 from stagectl.suggestion import closest
 
 LATEST = "latest"
-_STATE_STYLE = {"closed": "green", "recovered": "yellow", "recording": "cyan"}
+_STATE_STYLE = {"closed": "green", "recovered": "yellow", "recording": "cyan", "session": "cyan"}
 
 
 def folder_of(run: str, runs_root: Path) -> Path:

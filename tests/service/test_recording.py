@@ -200,7 +200,7 @@ def test_what_a_dead_service_left_is_marked_and_goes_with_the_others(tmp_path):
     states = {one.folder: (one.state, one.rows_count) for one in list_runs(root)}
     assert states[dead.folder] == states[powerless.folder] == states[awaited.folder] == ("recovered", 0)
     assert states[motions[powerless.folder]] == ("recovered", 200)
-    assert states[motions[living.folder]][0] == states[living.folder][0] == "recording"
+    assert (states[motions[living.folder]][0], states[living.folder][0]) == ("recording", "session")
     assert states[motions[awaited.folder]][0] == states[own.folder][0] == "crashed"
     run = read_run(motions[powerless.folder])
     assert not run.truncated
@@ -492,7 +492,7 @@ def test_a_run_that_its_recorder_left_is_counted_once_and_listed_as_crashed(tmp_
     session.begin_run("motion", "arm", 0)
     session.append(rows_from(0, 5000))
     session.flush()
-    assert [run.state for run in asyncio.run(quickly.summaries())] == ["recording", "recording"]
+    assert [run.state for run in asyncio.run(quickly.summaries())] == ["recording", "session"]
     session.abandon()
     crashed = {run.folder.name.split("-")[-1]: run for run in asyncio.run(quickly.summaries())}
     assert (crashed["motion"].state, crashed["motion"].rows_count) == ("crashed", 5000)
