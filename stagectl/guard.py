@@ -49,12 +49,12 @@ GUARD = np.dtype(
         ("macro_silence", "f8"),
         ("micro_silence", "f8"),
         ("commands_lost", "f8"),
-        ("late_cycles", "f8"),  # in a row, none of them with its own sample
+        ("late_cycles", "f8"),  # in a row, each more than `_LATE_CYCLES` ahead of its newest sample
     ]
 )
 
 _STROKE_SHARE = 0.95  # of the stroke: the hard stops are beyond
-_LATE_AGES = 5.0  # of the sensor's greatest age: without its own sample no cycle's following error is judged
+_LATE_CYCLES, _LATE_AGES = 3, 5.0  # later than that for so many times the sensor's greatest age is late for good
 _VELOCITY_SHARE = 0.2  # of a new difference in the guard's own velocity: 5 ms, 5 nm noise gives 2 um/s
 
 NEGATIVE_LIMIT, POSITIVE_LIMIT, SAFE_TORQUE_OFF = 1 << 0, 1 << 1, 1 << 3  # 0x60FD, CiA 402 (bit 3: interlock)
@@ -157,7 +157,6 @@ def _motion_stop(g: Record, m: Record, now: Record) -> int:
         g.macro_velocity_m_per_s = now.velocity_m_per_s
         g.cycle = m.cycle
     elapsed = m.sequence - g.cycle
-    fresh = m.samples_new > 0 and m.sequence == m.cycle
     if elapsed > 0 and m.samples_new > 0:  # a late line too: its own number says over which time the way went
         rate = (m.macro_position_m - g.macro_position_m) / (elapsed * g.period_s)
         g.macro_velocity_m_per_s += g.velocity_share * (rate - g.macro_velocity_m_per_s)
@@ -175,13 +174,17 @@ def _motion_stop(g: Record, m: Record, now: Record) -> int:
     rest_m = m.macro_position_m + 0.5 * v * abs(v) / g.stop_deceleration_m_per_s2
     if not g.travel_low_m <= rest_m <= g.travel_high_m:
         return _VELOCITY
-    # A late line leaves the position of the cycle before, a whole step behind; its age is watched by itself. Lines that
-    # are late for good lag by less than that: a sensor's clock 0.7 % too slow took a jog 8.5 mm from its reference.
-    g.late_cycles = 0.0 if fresh else g.late_cycles + 1.0
+    # Lines that are late for good are younger than the greatest age, and hide a sensor's clock that goes wrong: one
+    # that was 0.7 % too slow took a jog 8.5 mm from its reference.
+    lag = m.cycle - m.sequence
+    g.late_cycles = 0.0 if lag <= _LATE_CYCLES else g.late_cycles + 1.0
     if not g.late_cycles <= g.late_limit:
         return _SENSOR_AGE
-    judged = fresh or not np.isfinite(now.position_m)
-    if judged and not abs(m.end_position_m - now.position_m) <= g.following_error_m:
+    # A late line is judged at its own instant; without one there is nothing new to judge.
+    lag_s = lag * g.period_s
+    due_m = now.position_m - lag_s * (now.velocity_m_per_s - 0.5 * lag_s * now.acceleration_m_per_s2)
+    judged = m.samples_new > 0 or not np.isfinite(due_m)
+    if judged and not abs(m.end_position_m - due_m) <= g.following_error_m:
         return _FOLLOWING_ERROR
     return _NONE
 

@@ -78,9 +78,8 @@ def _age(m: Any, now: Any, g: Any) -> str:
     age_ms = (int(m["t_ns"]) - int(m["sample_t_ns"])) * 1e-6
     if not g["late_cycles"] <= g["late_limit"]:
         return (
-            f"each of the last {g['late_cycles']:.0f} cycles had to do without its own sample, limit "
-            f"{g['late_limit']:.0f}; the newest is {age_ms:.1f} ms old: check interferometer.rate_hz and transport_s, "
-            "and what delays its lines"
+            f"lines were late in each of the last {g['late_cycles']:.0f} cycles, limit {g['late_limit']:.0f}; the "
+            f"newest is {age_ms:.1f} ms old: check interferometer.rate_hz and transport_s, and what delays its lines"
         )
     return (
         f"newest sample {m['sequence']} is {age_ms:.1f} ms old, limit {g['sensor_age_ns'] * 1e-6:g} ms; "
