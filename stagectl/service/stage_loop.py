@@ -232,10 +232,7 @@ class StageLoop(StageWatch):
         try:
             profile = self._profile if self._profile is not None else load_profile(self._profile_asked)
             chosen = choose(profile, order.body.backend)
-        except (
-            ProfileError,
-            LinkError,
-        ) as error:  # of what was asked for: the world that is open is as sound as before
+        except (ProfileError, LinkError) as error:  # the world that is open is as sound as before
             raise RequestError(str(error)) from error
         self._log.say("backend", BANNERS[chosen], backend=chosen, asked=order.body.backend, before=self._backend)
         if chosen != self._backend:

@@ -41,7 +41,6 @@ SHIPPED_HEARTBEAT_S = load_profile("single-axis").trip.heartbeat_s
 _DISK_BYTES = 192 << 20
 _PATIENCE_S = 30.0
 _STANDS_S = 0.8  # heartbeat time and ramp, and as much again
-_TRIES = 3
 _RECORDED = ("jogging", "moving", "homing", "identifying", "at rest", "stopping")  # phases of which there is a run
 _APART = 1000  # draws between two seeds: more than one ever needs
 _SHARED_MEMORY = Path("/dev/shm")
@@ -157,25 +156,11 @@ def stopped(seen: dict[str, np.ndarray], killed_t_ns: int) -> Stopped:
 
 
 def _under_way(house: House, scene: real.Scenario) -> int:
-    """Bring the stage into the phase, wait; return an instant of its arming. A hiccup of the host gets it another try.
-
-    RuntimeError where it can't be had.
-    """
-    house.daemon.state_is("idle")
-    trouble = ""
-    for _ in range(_TRIES):
-        trouble = house.ready()
-        house.find_rig()
-        begun_t_ns = house.t_ns()
-        trouble = trouble or house.begin(scene.phase, scene.speed_m_per_s, scene.target_m)
-        if not trouble:
-            time.sleep(scene.wait_s)
-            fault = house.daemon.client.status().fault
-            if fault is None:
-                return begun_t_ns
-            trouble = fault.kind
-        house.let_go()
-    raise RuntimeError(f"the scene could not be set: {trouble}")
+    """Return an instant of the arming of a stage that is in its phase now. RuntimeError where it can't be had."""
+    begun_t_ns, trouble = real.under_way(house, scene)
+    if trouble:
+        raise RuntimeError(f"the scene could not be set: {trouble}")
+    return begun_t_ns
 
 
 def after_servo_kill(folder: Path, strike: Strike) -> tuple[Loss, Stopped | None]:

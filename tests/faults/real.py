@@ -151,11 +151,14 @@ def _record(runs: Path) -> Record:
     return record
 
 
-def _play(house: House, scenario: Scenario) -> Facts | str:
-    """Bring the stage into its phase, strike, watch, and find the way back; a text where there was no scene."""
+def under_way(house: House, scenario: Scenario) -> tuple[int, str]:
+    """Bring the stage into its phase, and wait; returns an instant of its arming, and why there is no scene, if so.
+
+    A hiccup of the host may trip it before anything was done to it: it gets another try.
+    """
     house.daemon.state_is("idle")
-    trouble = ""
-    for _ in range(_TRIES):  # a hiccup of the host may trip it before anything was done to it
+    begun_t_ns, trouble = 0, ""
+    for _ in range(_TRIES):
         trouble = house.ready()
         house.find_rig()
         begun_t_ns = house.t_ns()
@@ -167,7 +170,13 @@ def _play(house: House, scenario: Scenario) -> Facts | str:
                 break
             trouble = fault.kind
         house.let_go()
-    else:
+    return begun_t_ns, trouble
+
+
+def _play(house: House, scenario: Scenario) -> Facts | str:
+    """Bring the stage into its phase, strike, watch, and find the way back; a text where there was no scene."""
+    begun_t_ns, trouble = under_way(house, scenario)
+    if trouble:
         return trouble
     facts = Facts(begun_t_ns=begun_t_ns, phase=scenario.phase, jog_hold_s=JOG_HOLD_S)
     facts.planned_m_per_s = {"jogging": scenario.speed_m_per_s, "moving": TOP_M_PER_S}.get(scenario.phase, 0.0)
