@@ -90,21 +90,6 @@ def recovers(what: str) -> None:
     shell("systemctl", "reset-failed", UNIT)
 
 
-def arms(what: str) -> None:
-    """Home where that is void, arm, and hold with power: all of it, without a restart by hand."""
-    restarts = int(unit("NRestarts"))
-    with stage.lease():
-        if not stage.status()["homed"]:
-            stage.do("home")
-        if stage.status()["state"] == "idle":
-            stage.do("arm")
-        state = stage.await_state("armed", "fault")["state"]
-        held = "OPERATION_ENABLED" in rig.state()["drives"].values()
-        check(f"{what}: armed again", state == "armed" and held, rig.state()["drives"])
-    stage.await_state("idle")
-    check(f"{what}: that took no further restart", int(unit("NRestarts")) == restarts)
-
-
 def await_restart(what: str, before: int) -> None:
     """Wait for systemd's restart, and check it."""
 
@@ -213,7 +198,6 @@ def _without_supervisor(what: str, number: signal.Signals) -> None:
         loses_power(what, before)
     await_restart(what, before)
     recovers(what)
-    arms(what)
 
 
 def servo_out_of_memory() -> None:

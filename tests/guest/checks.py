@@ -33,8 +33,9 @@ GROUPS: dict[str, tuple[tuple[Group, ...], tuple[Group, ...]]] = {
     "motion": (
         (ready, opened),
         (
-            serial_unplugged, servo_killed, supervisor_killed, supervisor_hung, servo_out_of_memory,
-            supervisor_out_of_memory, moved, clock_stepped, can_down, recorded,
+            serial_unplugged, servo_killed, supervisor_hung, servo_out_of_memory, supervisor_out_of_memory,
+            supervisor_killed, moved,  # in this order: what systemd has started again is homed and armed
+            clock_stepped, can_down, recorded,
         ),
     ),
 }  # fmt: skip

@@ -32,6 +32,8 @@ def moved() -> None:
     """Home, jog, identify, scan."""
     with stage.lease():
         stage.do("home")
+        drives = rig.state()["drives"]
+        check("homed, it is armed", set(drives.values()) == {"OPERATION_ENABLED"}, drives)
         before = stage.status()["health"]
         began_m = rig.end_m()
         stage.do("jog", distance_m=JOG_M)
