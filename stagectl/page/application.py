@@ -19,12 +19,15 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from stagectl.errors import StagectlError
 from stagectl.page.feed import Feed
 from stagectl.page.reports import Reports
+from stagectl.service.access import Role
 
 ASSETS = Path(__file__).parent / "assets"
 
 _PASSED_ON = re.compile(r"[a-z]+(/[A-Za-z0-9._:-]{1,100})?")
 _HEADERS_PASSED_ON = ("content-type", "idempotency-key", "stagectl-lease")
 _TIMEOUT_S, _SEND_S = 5.0, 5.0
+_GOING_AWAY = 1001  # RFC 6455, 7.4.1: "a browser having navigated away from a page"
+_TOKEN_MOST = 100
 _KEPT_S = {"runs": 2.0, "log": 1.0}  # what every page asks for again and again
 _SERVICE = "http://stagectl"
 # A report brings its own style and drawings, and no script.
@@ -57,15 +60,20 @@ def application(socket_path: Path, reports: Reports) -> Starlette:
 
     async def stream(socket: WebSocket) -> None:
         await socket.accept()
-        gone = asyncio.create_task(_gone(socket))
+        leaving = asyncio.create_task(_lease_left_behind(socket))
         sending = asyncio.create_task(_send(socket, feed))
-        await asyncio.wait((gone, sending), return_when=asyncio.FIRST_COMPLETED)
-        for task in (gone, sending):
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
+        await asyncio.wait((leaving, sending), return_when=asyncio.FIRST_COMPLETED)
+        sending.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await sending
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await socket.close()
+        token = ""
+        with contextlib.suppress(TimeoutError):
+            token = await asyncio.wait_for(leaving, _SEND_S)
+        if token and socket.scope["stagectl_role"] is Role.OPERATE:
+            with contextlib.suppress(httpx.HTTPError):  # it runs out by itself
+                await service.delete("/v1/lease", headers={"stagectl-lease": token})
 
     async def report(request: Request) -> Response:
         try:
@@ -93,10 +101,18 @@ async def _send(socket: WebSocket, feed: Feed) -> None:
             await asyncio.wait_for(socket.send_text(text), _SEND_S)
 
 
-async def _gone(socket: WebSocket) -> None:
-    """Wait until the page is gone; what it says is not listened to."""
-    while (await socket.receive())["type"] != "websocket.disconnect":
-        pass
+async def _lease_left_behind(socket: WebSocket) -> str:
+    """Wait until the page is gone; return the token of the lease that it left behind, empty where there is none.
+
+    A page says its token whenever that changes. It is gone for good where its browser says so, which it does for a page
+    that crashed too. The page itself can't do this: a request from its `pagehide` got lost on busy hosts.
+    Where the connection breaks without a word, the page may come back: its lease is left to run out.
+    """
+    token = ""
+    while (said := await socket.receive())["type"] != "websocket.disconnect":
+        text = said.get("text") or ""
+        token = text if len(text) <= _TOKEN_MOST else ""
+    return token if said.get("code") == _GOING_AWAY else ""
 
 
 class _Relay:

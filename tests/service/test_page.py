@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 
 import httpx
 import pytest
@@ -259,3 +260,29 @@ def test_the_command_shows_links_and_the_next_one_when_one_was_used(daemon):
     finally:
         showing.kill()
         showing.communicate()
+
+
+@pytest.mark.parametrize(
+    ("role", "code", "given_back"),
+    [(Role.OPERATE, 1001, True), (Role.OPERATE, 1000, False), (Role.OBSERVE, 1001, False)],
+)
+def test_the_lease_that_a_page_said_is_given_back_when_its_browser_says_that_it_is_gone(
+    page, daemon, role, code, given_back
+):
+    with page.browser(role) as browser:
+        headers = {"Cookie": cookie_of(browser)}
+
+    async def say_and_go(token):
+        uri = f"ws://127.0.0.1:{page.port}/v1/stream"
+        stream = await websockets.connect(uri, origin=page.address, additional_headers=headers)
+        for said in ("x" * 3000, token):
+            await stream.send(said)
+        await stream.close(code)
+
+    with daemon.client.lease("a page", duration_s=5.0) as lease:
+        asyncio.run(say_and_go(lease.token))
+        if given_back:
+            daemon.until(lambda: daemon.client.lease_state() is None, "a free lease")
+        else:
+            time.sleep(0.5)
+            assert daemon.client.lease_state() is not None

@@ -185,19 +185,37 @@ def test_a_joint_identified_from_the_page_stands_there_and_says_that_it_is_worn(
     state_is(page, "idle")
 
 
-def test_a_page_that_vanishes_in_the_middle_of_a_jog_stops_the_stage(idle, opened, chromium):
-    page = armed_page(opened)
-    press(page, "#jog-left")
-    idle.state_is("moving")
+def signal_pages(chromium, number):
+    """Send a signal to the processes that draw pages; no handler of a page runs."""
     processes = chromium.new_browser_cdp_session().send("SystemInfo.getProcessInfo")["processInfo"]
     for process in processes:
         if process["type"] == "renderer":
-            os.kill(process["id"], signal.SIGKILL)  # no handler of ours runs
-    idle.until(lambda: idle.client.status().state == "armed", "the jog's end")
-    assert idle.client.status().lease is not None
-    idle.state_is("fault")
-    assert idle.client.status().fault.kind == "LEASE"
-    assert stands_still(idle)
+            os.kill(process["id"], number)
+
+
+def test_a_page_that_crashes_in_the_middle_of_a_jog_stops_the_stage_and_leaves_no_lease(idle, opened, chromium):
+    page = armed_page(opened)
+    press(page, "#jog-left")
+    idle.state_is("moving")
+    signal_pages(chromium, signal.SIGKILL)
+    idle.state_is("idle")
+    assert idle.client.status().fault is None
+    idle.until(lambda: idle.client.lease_state() is None, "a free lease")
+
+
+def test_a_page_that_hangs_in_the_middle_of_a_jog_stops_the_stage(idle, opened, chromium):
+    page = armed_page(opened)
+    press(page, "#jog-left")
+    idle.state_is("moving")
+    signal_pages(chromium, signal.SIGSTOP)
+    try:
+        idle.until(lambda: idle.client.status().state == "armed", "the jog's end")
+        assert idle.client.status().lease is not None
+        idle.state_is("fault")
+        assert idle.client.status().fault.kind == "LEASE"
+        assert stands_still(idle)
+    finally:
+        signal_pages(chromium, signal.SIGCONT)
 
 
 def test_leaving_the_page_gives_the_lease_back(idle, opened):

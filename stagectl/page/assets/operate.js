@@ -15,8 +15,11 @@ const byId = (id) => document.getElementById(id);
 const sleep = (ms) => new Promise((resolve) => { setTimeout(resolve, ms); });
 
 export class Operator {
-  constructor() {
-    this.token = '';
+  #token = '';
+
+  // `say` tells the page's process which lease this page holds: it gives the lease back when the page is gone.
+  constructor(say) {
+    this.say = say;
     this.status = null;
     this.mayOperate = null; // until the page's process has said
     this.unanswered = null; // the press that nobody answered: {what, pressKey}
@@ -111,11 +114,11 @@ export class Operator {
     } finally { this.renewing = false; }
   }
 
-  leave() {
-    this.jog = 0;
-    if (!this.token) return;
-    fetch('/v1/lease', { method: 'DELETE', headers: { 'Stagectl-Page': key, 'Stagectl-Lease': this.token }, keepalive: true }).catch(() => {});
-    this.token = '';
+  get token() { return this.#token; }
+
+  set token(token) {
+    this.#token = token;
+    this.say(token);
   }
 
   // ---- jog: said again and again while it is held; the service lets go by itself when it isn't, and what comes late
@@ -327,6 +330,6 @@ export class Operator {
     addEventListener('keyup', (event) => { if (event.key === 'ArrowLeft' || event.key === 'ArrowRight') this.letGo(); });
     addEventListener('blur', () => this.letGo());
     document.addEventListener('visibilitychange', () => { if (document.hidden) this.letGo(); });
-    addEventListener('pagehide', () => this.leave());
+    addEventListener('pagehide', () => this.letGo());
   }
 }

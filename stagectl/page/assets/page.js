@@ -26,7 +26,8 @@ function clock(at) {
   return `${when.getFullYear()}-${twoDigits(when.getMonth() + 1)}-${twoDigits(when.getDate())} ${time}`;
 }
 
-const operator = new Operator();
+let stream = null;
+const operator = new Operator((token) => { if (stream?.readyState === WebSocket.OPEN) stream.send(token); });
 let scope = null;
 let heardAt = performance.now();
 let missedAtFirst = null;
@@ -188,7 +189,8 @@ function take(message) {
 }
 
 function listen() {
-  const stream = new WebSocket(`ws://${location.host}/v1/stream`);
+  stream = new WebSocket(`ws://${location.host}/v1/stream`);
+  stream.onopen = () => stream.send(operator.token);
   stream.onmessage = (event) => take(JSON.parse(event.data));
   stream.onclose = async () => {
     const answer = await fetch('/session').catch(() => null);
