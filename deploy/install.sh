@@ -101,7 +101,7 @@ make_release() { # NAME WHEELS
     local from=()
     [[ -z $2 ]] || from=(--no-index --find-links "$2")
     "$PYTHON" -m venv "$folder/venv"
-    "$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-input "${from[@]}" \
+    "$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-input --no-cache-dir "${from[@]}" \
       --editable "$folder" || refuse "the packages could not be installed; the version before, if any, is untouched"
     "$folder/venv/bin/python" -m compileall -q "$folder/stagectl" "$folder/drivers" "$folder/sim_backend"
   fi
@@ -120,19 +120,22 @@ switch_to() { # RELEASE
     mv -T "$program/.current" "$program/current"
     rm -rf "$DESTDIR"/var/cache/stagectl/* # compiled from other sources
   fi
-  find "$program" -mindepth 1 -maxdepth 1 ! -name "$1" ! -name current -exec rm -rf {} +
   mkdir -p "$DESTDIR/usr/local/bin"
   local command=$DESTDIR/usr/local/bin/stagectl target=$PROGRAM/current/venv/bin/stagectl
   [[ $(readlink "$command" 2>/dev/null) == "$target" ]] || ln -sf "$target" "$command"
 }
 
-put_files() {
+remove_other_releases() { # RELEASE
+  find "$DESTDIR$PROGRAM" -mindepth 1 -maxdepth 1 ! -name "$1" ! -name current -exec rm -rf {} +
+}
+
+put_files() { # SOURCE
   local entry from to
   for entry in "${FILES[@]}"; do
     read -r from to <<<"$entry"
-    put "$SOURCE/deploy/$from" "$to"
+    put "$1/deploy/$from" "$to"
   done
-  [[ -e $DESTDIR/etc/stagectl/stagectl.env ]] || put "$SOURCE/deploy/stagectl.env" /etc/stagectl/stagectl.env
+  [[ -e $DESTDIR/etc/stagectl/stagectl.env ]] || put "$1/deploy/stagectl.env" /etc/stagectl/stagectl.env
   if staged; then
     mkdir -p "$DESTDIR/var/lib/stagectl/runs" "$DESTDIR/var/cache/stagectl"
     return
@@ -146,8 +149,19 @@ put_files() {
   udevadm trigger --action=add --subsystem-match=tty --subsystem-match=usb-serial
 }
 
+# Whatever fails between the service's stop and its start: a stage PC is left with the release that ran.
+go_back() { # RELEASE
+  local failed=$?
+  trap - EXIT
+  say "the new release could not be put in place, or does not start (journalctl -u stagectl): back to $1" >&2
+  { switch_to "$1" && put_files "$PROGRAM/$1" && systemctl reset-failed stagectl.service &&
+    systemctl restart stagectl.service && say "the service runs again, as it was" >&2; } ||
+    say "the service is stopped: systemctl status stagectl" >&2
+  exit $((failed == 0 ? 1 : failed))
+}
+
 install_release() { # install | upgrade, WHEELS
-  local release was_active=
+  local release before was_active=
   check_host
   if [[ $1 == upgrade && ! -L $DESTDIR$PROGRAM/current ]]; then
     refuse "nothing is installed in $DESTDIR$PROGRAM; use install"
@@ -155,18 +169,23 @@ install_release() { # install | upgrade, WHEELS
   release=$(release_name)
   check_at_rest
   make_release "$release" "$2"
-  if service_runs && [[ $(readlink "$PROGRAM/current") != "$release" ]]; then
+  before=$(readlink "$DESTDIR$PROGRAM/current") || true
+  if service_runs && [[ $before != "$release" ]]; then
     check_at_rest # making the release took minutes
     was_active=yes
     say "stopping the service"
+    # shellcheck disable=SC2064 # the release that runs now
+    trap "go_back '$before'" EXIT
     systemctl stop stagectl.service
   fi
   switch_to "$release"
-  put_files
+  put_files "$SOURCE"
   if [[ -n $was_active ]]; then
     systemctl start stagectl.service
+    trap - EXIT
     say "the service runs again"
   fi
+  remove_other_releases "$release"
   say "stagectl $release is installed"
   [[ $1 == upgrade ]] || say "next: /etc/stagectl/stagectl.env, then systemctl enable --now stagectl ($PROGRAM/current/docs/operations.md)"
 }

@@ -89,6 +89,7 @@ def upgraded() -> None:
     content = [path.read_bytes() for path in yours]
     release = os.readlink(PROGRAM / "current")
     rig.start(bring_release(before=False))  # nothing is connected to it yet
+    fails_to_start(release)
     shell(INSTALL, "upgrade")
     now = os.readlink(PROGRAM / "current")
     check("an upgrade switches to the new release", now != release, now)
@@ -97,6 +98,19 @@ def upgraded() -> None:
     check("an upgrade starts again what ran", unit("ActiveState") == "active")
     listed = until("the runs", lambda: stage.ask("GET", "/v1/runs"))
     check("the runs are listed", listed, [run["name"] for run in listed])
+
+
+def fails_to_start(release: str) -> None:
+    """An upgrade to what doesn't start ends with an error, and with `release` running as before."""
+    refusing = DROP_IN.with_name("refusing.conf")
+    refusing.write_text(f"[Service]\nExecStartPre=/bin/sh -c 'test $$(readlink {PROGRAM}/current) = {release}'\n")
+    shell("systemctl", "daemon-reload")
+    failed = subprocess.run([INSTALL, "upgrade"], capture_output=True, text=True)
+    left = os.readlink(PROGRAM / "current"), unit("ActiveState")
+    went_back = failed.returncode != 0 and left == (release, "active")
+    check("an upgrade to what does not start leaves the one before running", went_back, f"{left}, {failed.stderr}")
+    refusing.unlink()
+    shell("systemctl", "daemon-reload")
 
 
 def confined() -> None:
