@@ -15,10 +15,12 @@ PROGRAM = Path("/opt/stagectl")
 PROFILE = Path("/etc/stagectl/stage-100hz.toml")
 RUNS = Path("/var/lib/stagectl/runs")
 DROP_IN = Path("/etc/systemd/system/stagectl.service.d/guest.conf")
-FOLDERS = ("/etc", "/opt", "/usr/local", "/var/lib", "/var/cache", "/run/stagectl", "/dev/shm", "/dev/stagectl")
-# The system's own: its state, and the copies that it keeps of the accounts' files.
+FOLDERS = ("/", "/run/stagectl", "/dev/shm", "/dev/stagectl")
+# No disk's, or this test's own.
+PASSED_OVER = {"/proc", "/sys", "/dev", "/run", "/tmp", "/var/tmp", "/srv", "/mnt"}
+# The system's own: its state and logs, and the copies that it keeps of the accounts' files.
 OF_THE_SYSTEM = (
-    "/var/lib/systemd/", "/var/lib/dbus/", "/var/cache/ldconfig/", "/etc/ld.so.cache", "/etc/machine-id",
+    "/var/lib/systemd/", "/var/log/journal/", "/var/lib/dbus/", "/var/cache/ldconfig/", "/etc/ld.so.cache", "/etc/machine-id",
     "/etc/passwd-", "/etc/group-", "/etc/shadow-", "/etc/gshadow-", "/etc/subuid-", "/etc/subgid-", "/etc/.pwd.lock",
 )  # fmt: skip
 # Between packages and sources only the links count: what lies in an environment is pip's.
@@ -32,7 +34,8 @@ def everything() -> set[str]:
     found = set()
     for folder in FOLDERS:
         for place, folders, files in os.walk(folder):
-            folders[:] = [name for name in folders if f"/{name}/" != ENVIRONMENT]
+            place = place.rstrip("/")
+            folders[:] = [n for n in folders if f"/{n}/" != ENVIRONMENT and f"{place}/{n}" not in PASSED_OVER]
             found.update(f"{place}/{name}" for name in [*folders, *files])
     accounts = [*Path("/etc/passwd").read_text().split("\n"), *Path("/etc/group").read_text().split("\n")]
     return {path for path in found if not path.startswith(OF_THE_SYSTEM)} | {line for line in accounts if line}
