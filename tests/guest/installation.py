@@ -21,7 +21,8 @@ PASSED_OVER = {"/proc", "/sys", "/dev", "/run", "/tmp", "/var/tmp", "/srv", "/mn
 # The system's own: its state and logs, and the copies that it keeps of the accounts' files.
 OF_THE_SYSTEM = (
     "/var/lib/systemd/", "/var/log/journal/", "/var/lib/dbus/", "/var/cache/ldconfig/", "/etc/ld.so.cache",
-    "/etc/machine-id", "/etc/passwd-", "/etc/group-", "/etc/shadow-", "/etc/gshadow-", "/etc/subuid-", "/etc/subgid-", "/etc/.pwd.lock",
+    "/etc/machine-id", "/etc/passwd-", "/etc/group-", "/etc/shadow-", "/etc/gshadow-", "/etc/subuid-", "/etc/subgid-",
+    "/etc/.pwd.lock",
 )  # fmt: skip
 # Between packages and sources only the links count: what lies in an environment is pip's.
 ENVIRONMENT = "/venv/"
