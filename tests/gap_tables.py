@@ -69,7 +69,7 @@ def axis_table(seed: int, count: int = 8000, friction_n: float = 0.0, amplitude_
     }
 
 
-def stage_table(seed: int, count: int = 8000) -> dict:
+def stage_table(seed: int, count: int = 8000, end_kg: float = 40.0) -> dict:
     """A macro-micro stage of the oled-printer profile that stays off its edges; columns by name, shape (count,)."""
     random = np.random.default_rng(seed)
     t = np.arange(count) * H
@@ -87,7 +87,7 @@ def stage_table(seed: int, count: int = 8000) -> dict:
     apart, apart_rate, _ = sines((1.1, 20e-6), (2.3, 10e-6))
     relative = -JOINT_CENTRE_M + apart  # end minus macro
     joint = -500.0 * relative - 5.0 * apart_rate  # on the end
-    micro = 40.0 * a - joint  # the end's acceleration is the macro's but for 5 mm/s2
+    micro = end_kg * a - joint  # the end's acceleration is the macro's but for 5 mm/s2
     return {
         "t_s": t,
         "macro": x - relative + NOISE_M * random.standard_normal(count),

@@ -35,7 +35,7 @@ _FACTOR_OTHER = 1.4  # of a machine's whole accelerating mass: less is what a hi
 # force that nobody said to push the macro back looks like 30 %)
 _FACTOR_SDS = 20.0  # of all recordings together, in what is stated of mass and force constant
 _FACTOR_SIGMAS = 6.0
-_SWAP_RATIO = 0.25  # of the squares that are left
+_SWAP_RATIO = 0.25  # of the squares that are left, each axis's in its own inertia force's
 _GOOD_RATIO = 0.02  # of the squares of the inertia force
 _SAME_RATIO = 0.5  # of the samples
 _NEAR = 3.0  # of a unit's factor: what follows velocity and position takes its share
@@ -63,8 +63,7 @@ class _Balance:
     factor_sd: float
     explained_ratio: float
     weight: float
-    whole: float  # square of inertia force
-    left: float  # of inertia force minus modelled forces
+    left_ratio: float  # square of inertia force minus modelled forces, in that of the inertia force
 
 
 def check(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> tuple[str, ...]:
@@ -205,8 +204,7 @@ def _balance(recording: Recording, axis: str) -> _Balance:
         factor_sd=float(np.sqrt(covariance[0, 0]) / scale[0]),
         explained_ratio=1.0 - float(np.mean(rest**2)) / max(whole, 1e-300),
         weight=1.0 / max(float(normal[0, 0]) / scale[0] ** 2, 1e-300),
-        whole=whole,
-        left=float(np.mean((inertia_n - force_n) ** 2)),
+        left_ratio=float(np.mean((inertia_n - force_n) ** 2)) / max(whole, 1e-300),
     )
 
 
@@ -231,12 +229,12 @@ def _check_swapped(believed: Believed, recordings: Sequence[Recording], balances
     for recording in recordings:
         _check_gap_side(recording)
         own = [b for b in balances if b.run == recording.log.name]
-        if all(b.left < _GOOD_RATIO * b.whole for b in own):
+        if all(b.left_ratio < _GOOD_RATIO for b in own):
             continue  # columns that are not what they are called leave more
-        left = sum(b.left for b in own)
+        left = sum(b.left_ratio for b in own)
         for text, log in _variants(recording.log):
             other = balance.recording_of(log, believed)
-            if sum(_balance(other, axis).left for axis in other.axes) < _SWAP_RATIO * left:
+            if sum(_balance(other, axis).left_ratio for axis in other.axes) < _SWAP_RATIO * left:
                 raise RequestError(f"{log.name}: forces and motion agree far better with {text}; map the columns again")
 
 
