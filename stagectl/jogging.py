@@ -57,11 +57,21 @@ def splice(
     travel_m: tuple[float, float],
     dt_s: float,
 ) -> tuple[Splice, Trajectory] | None:
-    """Plan on from a row of the segment under way that is `AHEAD_S` from now; None where it ends before that."""
+    """Plan on from a row of the segment under way that is `AHEAD_S` from now; None where that pays no more.
+
+    So it is where the one under way ends before that, brakes already, or where the new one would leave the travel: the
+    same way to rest, planned once more from one of its rows, ends 1e-17 m further.
+    """
     at_row = done_rows + math.ceil(AHEAD_S / dt_s)
     if at_row >= under_way.size:
         return None
     row = under_way[at_row - 1]
     start = MotionState(float(row["position_m"]), float(row["velocity_m_per_s"]), float(row["acceleration_m_per_s2"]))
     planned = way(start, velocity_m_per_s, limits, travel_m, dt_s)
+    if velocity_m_per_s == 0.0 and under_way.size - at_row < planned.setpoints.size:
+        return None
+    position_m = planned.setpoints["position_m"]
+    low_m, high_m = min(travel_m[0], start.position_m), max(travel_m[1], start.position_m)
+    if position_m.min() < low_m or position_m.max() > high_m:
+        return None
     return Splice(at_row, planned.setpoints[1:]), planned

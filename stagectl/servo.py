@@ -66,6 +66,10 @@ _POWERED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia4
 _DRIVE_HOMES = (Phase.HOMING_DRIVE, Phase.HOMED_DRIVE)
 """The start of its homing stays set while the drive holds the index: a second edge would search again."""
 
+_HELD_S, _HELD_M = 0.02, 1e-4
+"""How far the macro may be from where its drive held it that time ago: 5 mm/s, twenty times what settling shows."""
+_ATTAINED_S = 0.05  # in which a drive counts from its index on, and settles there
+
 RELEASE_CYCLES = 100
 """What a drive has for showing that it is without power, before a servo that was asked to leaves."""
 
@@ -138,6 +142,7 @@ class Servo:
         self._offsets = {name: layout[name][1] for name in ROW.names or ()}
         self._homing_id = 0
         self._searches = False  # the macro's drive has power for its homing
+        self._held_m = float("nan")  # where it holds its index, smoothed; nan: not looked at yet
         self._stated_text = ""
         self._status = np.zeros(1, STATUS)
         self._status["error_m"] = np.nan  # until a line was there
@@ -581,6 +586,14 @@ class Servo:
             self._end(Stop.DRIVE_FAULT, Phase.QUICK_STOP, t_ns, self._detail(Stop.DRIVE_FAULT))
             return cia402.State.QUICK_STOP_ACTIVE, off
         self._searches = state is on
+        if homed and not self._holds_index((t_ns - self._phase_since_t_ns) * 1e-9):
+            moved_m = abs(seen.macro_encoder_m - self._held_m)
+            text = (
+                f"the macro's drive held its index, and moved {moved_m * 1e6:.0f} um within {_HELD_S * 1e3:g} ms, limit "
+                f"{_HELD_M * 1e6:g} um; see who else writes to the drive, its mode say, and what pushes the macro"
+            )
+            self._end(Stop.FOLLOWING_ERROR, Phase.QUICK_STOP, t_ns, text)
+            return cia402.State.QUICK_STOP_ACTIVE, off
         if not homed and state is on and (t_ns - self._phase_since_t_ns) * 1e-9 > 0.05:
             progress = cia402.homing_of(seen.macro_statusword)
             if progress is cia402.Homing.ATTAINED:
@@ -591,6 +604,20 @@ class Servo:
                 self._end(Stop.HOMING_GIVEN_UP, Phase.QUICK_STOP, t_ns, text)
                 return cia402.State.QUICK_STOP_ACTIVE, off
         return on, off
+
+    def _holds_index(self, in_phase_s: float) -> bool:
+        """Tell whether the macro is where its drive held it; no law or guard looks at it meanwhile.
+
+        A foreign master that changed the drive's mode sent it off at 23 m/s^2.
+        """
+        encoder_m = self._seen.macro_encoder_m
+        if in_phase_s <= _ATTAINED_S:
+            self._held_m = encoder_m
+        moved_m = encoder_m - self._held_m
+        if not abs(moved_m) <= _HELD_M:
+            return False
+        self._held_m += self._period_s / _HELD_S * moved_m
+        return True
 
     def _controlword(self, statusword: int, target: cia402.State) -> int:
         """Return the next controlword; a fault is reset only on request, on a rising edge."""

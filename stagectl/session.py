@@ -302,7 +302,9 @@ class Session:
             self._remark(remark)
         for remark in self.remarks:
             self._event("remark", text=remark)
-        self._await_sensor()
+        status = self._await_sensor()
+        if not status["sensor_ready"]:
+            raise LinkError(stop_sentence(Stop(int(status["stop"])), self.detail))
         self._watches = True
 
     def _remark(self, text: str) -> None:
@@ -351,16 +353,13 @@ class Session:
         return limits_n
 
     def _await_sensor(self) -> np.void:
-        """Wait until the sensor's clock is locked; LinkError says what the interferometer lacks."""
+        """Wait until the sensor's clock is locked, or something stops the stage; LinkError where it takes too long."""
         try:
-            status = self._wait(lambda s: bool(s["sensor_ready"]), _SENSOR_TIMEOUT_S, "waiting for the interferometer")
+            return self._wait(lambda s: bool(s["sensor_ready"]), _SENSOR_TIMEOUT_S, "waiting for the interferometer")
         except TimingError as error:
             if self._stalled_s > _STALL_S:
                 raise
             raise LinkError(self._sensor_text()) from error
-        if not status["sensor_ready"]:
-            raise LinkError(stop_sentence(Stop(int(status["stop"])), self.detail))
-        return status
 
     def _sensor_text(self) -> str:
         """Say what came of the interferometer in the last second instead of valid samples."""

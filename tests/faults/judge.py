@@ -145,7 +145,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     found: list[tuple[str, str]] = []
     if not facts.struck:
         found.append((COURSE, "the fault never struck: what there is says nothing of it"))
-    if drawn.must_stop and not facts.fault_kind and facts.phase not in AT_WILL:
+    if drawn.must_stop and not facts.fault_kind and facts.phase not in AT_WILL and not _drive_homes(drawn, facts):
         found.append((COURSE, "it went on"))
     if not drawn.may_stop and facts.fault_kind:
         found.append((COURSE, f"stopped by {facts.fault_kind}"))
@@ -154,10 +154,11 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     if not facts.fault_kind and facts.phase in ("stopping", "idle"):  # a homing takes power away and gives it again
         at = int(np.searchsorted(t_ns, facts.fault_t_ns))
         found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
+    blind_s = drawn.lasts_s if drawn.open_loop and not np.isfinite(drawn.detection_s) else 0.0
     if not facts.fault_kind:
-        found += _unstopped(facts, record, of)
+        found += _unstopped(facts, record, of, blind_s)
     elif noticed is not None and not np.isfinite(drawn.detection_s):
-        found += [(TRAVEL, text) for text in astray(facts, record.columns, noticed, of)]
+        found += [(TRAVEL, text) for text in astray(facts, record.columns, noticed, of, blind_s)]
     if drawn.silent and facts.phase == "jogging":
         way_m, silent_m = silent_way_m(facts, facts.fault_t_ns, end, of)
         if not way_m <= silent_m:
@@ -223,16 +224,26 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     return Verdict(tuple(found), stopped, travel_m, bound_m, begun, lost, drift_m)
 
 
-def _unstopped(facts: Facts, record: Record, of: Mechanics) -> list[tuple[str, str]]:
+def _drive_homes(drawn: Drawn, facts: Facts) -> bool:
+    """Tell whether the macro's drive homed by itself while the lasers failed: the micro gets power when a law does."""
+    if not drawn.by_lasers or facts.phase != "homing":
+        return False
+    failed = facts.fault_t_ns, facts.fault_t_ns + round(1e9 * (drawn.lasts_s + drawn.detection_s))
+    at, end = (int(np.searchsorted(facts.seen["t_ns"], t_ns)) for t_ns in failed)
+    return not (facts.seen["states"][at : end + 1, 1] == ENABLED).any()
+
+
+def _unstopped(facts: Facts, record: Record, of: Mechanics, blind_s: float) -> list[tuple[str, str]]:
     """Judge a run in which nothing stopped the motion but its own end, or the operator."""
     found = [(STANDSTILL, text) for text in not_at_rest(facts)]
-    found += [(TRAVEL, text) for text in astray(facts, record.columns, facts.judged_until_t_ns, of)]
+    found += [(TRAVEL, text) for text in astray(facts, record.columns, facts.judged_until_t_ns, of, blind_s)]
     found += [(TRAVEL, text) for text in not_ended(facts, record.columns, of)]
     if facts.stop_asked_t_ns:
         seen = facts.seen
         at, end = (int(np.searchsorted(seen["t_ns"], t)) for t in (facts.stop_asked_t_ns, facts.judged_until_t_ns))
         off = np.flatnonzero(~np.isin(seen["states"][at:end, 0], _POWERED))
-        end = at + int(off[0]) + 1 if off.size else end  # at rest its power is taken, and it may roll
+        # At rest its power is taken, and it may roll, or be thrown back by what it pressed against.
+        end = at + max(int(off[0]), 1) if off.size else end
         position, speed = seen["macro_position_m"][at:end], np.abs(seen["macro_velocity_m_per_s"][at:end])
         way_m = float(np.abs(position - position[0]).max(initial=0.0))
         by_law = replace(of, ramp_m_per_s2=of.law_ramp_m_per_s2)

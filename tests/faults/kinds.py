@@ -54,6 +54,7 @@ class Drawn:
     silent: bool = False  # the operator says nothing more: a jog ends by its own hold, before the lease does
     encoder_m: float = 0.0  # by which the drive's own encoder is off for a while: it holds on that
     pushed: bool = False  # by something that is no command: how far is not judged
+    by_lasers: bool = False  # of what only a law goes by: while the drive homes by itself it must stop nothing
 
 
 Draw = Callable[[np.random.Generator, str], Drawn]
@@ -249,7 +250,11 @@ def beam_break(rng: np.random.Generator, phase: str) -> Drawn:
     axis, duration_s = one_of(rng, ("macro", "end", "both")), between(rng, 2e-3, 0.8)
     fault = Fault("beam_loss", axis=axis, duration_s=duration_s)
     return Drawn(
-        f"no beam on {axis} for {duration_s * 1e3:.0f} ms", (fault,), detection_s=AT_ONCE_S, lasts_s=duration_s
+        f"no beam on {axis} for {duration_s * 1e3:.0f} ms",
+        (fault,),
+        detection_s=AT_ONCE_S,
+        lasts_s=duration_s,
+        by_lasers=True,
     )
 
 
@@ -262,6 +267,7 @@ def sensor_silence(rng: np.random.Generator, phase: str) -> Drawn:
         must_stop=must,
         detection_s=SILENCE_S + CYCLE_S if must else NEVER_S,
         lasts_s=duration_s,
+        by_lasers=True,
     )
 
 
@@ -275,13 +281,12 @@ def sensor_garbage(rng: np.random.Generator, phase: str) -> Drawn:
 
 def sequence_gap(rng: np.random.Generator, phase: str) -> Drawn:
     count = round(between(rng, 2, 5000))
-    return Drawn(f"{count} sequence numbers skipped", (Fault("sequence_gap", count=count),), detection_s=AT_ONCE_S)
+    fault = Fault("sequence_gap", count=count)
+    return Drawn(f"{count} sequence numbers skipped", (fault,), detection_s=AT_ONCE_S, by_lasers=True)
 
 
 def sensor_restart(rng: np.random.Generator, phase: str) -> Drawn:
-    """Before a homing has taken its zeros nothing counts from where the device began."""
-    must = phase != "homing"
-    return Drawn("interferometer restarted", (Fault("sensor_restart"),), must_stop=must, detection_s=AT_ONCE_S)
+    return Drawn("interferometer restarted", (Fault("sensor_restart"),), detection_s=AT_ONCE_S, by_lasers=True)
 
 
 def counts_stuck(rng: np.random.Generator, phase: str) -> Drawn:

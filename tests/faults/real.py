@@ -39,7 +39,9 @@ _PHASES = {  # for how long a fault may wait in each, and how often one is drawn
 _IN_TURN = {"client vanishes": ("jogging", "at rest", "jogging", "jogging", "moving")}  # mostly what it is there for
 _TOUCHING_S = 2.0  # of a homing with a micro
 _REST_S, _OVER_S, _NEVER_RESTS_S = 0.2, 0.6, 10.0
+_ENDS_S = 30.0  # a motion that goes on; a homing with a micro takes 15 s
 _TRIES = 3
+_GONE = "the rig was gone before its macro rested: what it did there is unknown"
 
 
 @dataclass(frozen=True)
@@ -186,8 +188,11 @@ def _play(house: House, scenario: Scenario) -> Facts | str:
     drawn_fault.act(house)
     held_up_s = _watched(house, scenario, before)
     house.let_go()
-    facts.judged_until_t_ns = int(house.seen["t_ns"][-1])
+    if drawn_fault.must_stop:
+        facts.judged_until_t_ns = int(house.seen["t_ns"][-1])
     _name_fault(house, scenario, facts)
+    if not drawn_fault.must_stop:  # behind the question: to write it all holds the rig up, which may stop the stage
+        facts.judged_until_t_ns = _seen_until_t_ns(house)
     time.sleep(0.3 if drawn_fault.lasts_s else 0.0)
     facts.trouble = house.ready()
     until_t_ns = facts.judged_until_t_ns
@@ -224,14 +229,16 @@ def _name_fault(house: House, scenario: Scenario, facts: Facts) -> None:
 def _watched(house: House, scenario: Scenario, before: dict) -> float:
     """Follow the true motion until the fault must have had its effect, and the macro rests.
 
-    What the rig saw is fetched as soon as the macro rests, and no sooner: a service that lost its servo lets go of that
+    A motion that may go on goes on to its own end; a jog's key is let go of for it. Of a fault that must stop it, what
+    the rig saw is fetched as soon as the macro rests, and no sooner: a service that lost its servo lets go of that
     world, and the rig goes with it; but to write it all holds the rig up for 20 ms. Returns for how long the rig was
     held up until the fault must have been noticed, in s: what it was later is no excuse.
     """
     fault = scenario.fault.drawn
     detection_s = fault.detection_s if np.isfinite(fault.detection_s) else 0.0
     least_s = max(fault.lasts_s, detection_s) + _OVER_S
-    rests_not = not fault.must_stop or MACRO in fault.without_power or scenario.phase == "idle"
+    longest_s = least_s + (_NEVER_RESTS_S if fault.must_stop else _ENDS_S)
+    rests_not = MACRO in fault.without_power or scenario.phase == "idle"
     begin_s, rested_s, kept = time.monotonic(), 0.0, False
     before_ns, held_up_s, noticed = before["held_up_ns"], 0.0, False
     while True:
@@ -244,15 +251,27 @@ def _watched(house: House, scenario: Scenario, before: dict) -> float:
             watched_s = now_s - begin_s
             if not noticed:
                 held_up_s = 1e-9 * (state["held_up_ns"] - before_ns)
-                noticed = rests or (np.isfinite(fault.detection_s) and watched_s > detection_s + held_up_s)
-            if rests and not kept:
+                over_s = detection_s + held_up_s if np.isfinite(fault.detection_s) else least_s
+                noticed = rests or watched_s > over_s
+            if rests and fault.must_stop and not kept:
                 house.look_back()
                 kept = True
-            if (watched_s > least_s and (rests or rests_not)) or watched_s > least_s + _NEVER_RESTS_S:
-                house.look_back()
+            if watched_s > least_s and not fault.must_stop:
+                house.let_go()
+            if (watched_s > least_s and (rests or rests_not)) or watched_s > longest_s:
+                if fault.must_stop:
+                    house.look_back()
                 return held_up_s
         except LinkError:
             if not kept:
-                raise HostHeldUp("the rig was gone before its macro rested: what it did there is unknown") from None
+                raise HostHeldUp(_GONE) from None
             return held_up_s
         time.sleep(LOOK_S)
+
+
+def _seen_until_t_ns(house: House) -> int:
+    """Fetch what the rig saw; return until when."""
+    try:
+        return int(house.look_back()["t_ns"][-1])
+    except LinkError:
+        raise HostHeldUp(_GONE) from None

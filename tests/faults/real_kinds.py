@@ -125,7 +125,8 @@ def _of_rig(text: str, faults: dict, **known) -> Real:
 def beam_break(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
     axis, duration_s = one_of(rng, ("macro", "end", "both")[: 1 if len(nodes) == 1 else 3]), between(rng, 5e-3, 0.8)
     fault = {"kind": "beam_loss", "axis": axis, "duration_s": duration_s}
-    return _of_rig(f"no beam on {axis} for {duration_s * 1e3:.0f} ms", fault, detection_s=AT_ONCE_S)
+    text = f"no beam on {axis} for {duration_s * 1e3:.0f} ms"
+    return _of_rig(text, fault, detection_s=AT_ONCE_S, by_lasers=True)
 
 
 def unplugged(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
@@ -149,6 +150,7 @@ def sensor_silence(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
         must_stop=must,
         detection_s=SENSOR_S if must else NEVER_S,
         open_loop=True,
+        by_lasers=True,
     )
 
 

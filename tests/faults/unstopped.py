@@ -21,13 +21,18 @@ _KEPT = ("at rest", "accelerating", "constant speed", "decelerating", "jogging",
 """Phases that have one reference from their begin to their end; a homing finds its zero only then."""
 
 
-def astray(facts: Facts, columns: dict[str, np.ndarray], until_t_ns: int, of: Mechanics) -> list[str]:
-    """Return where the true motion, from the fault until then, was not the one that was asked for."""
+def astray(
+    facts: Facts, columns: dict[str, np.ndarray], until_t_ns: int, of: Mechanics, blind_s: float = 0.0
+) -> list[str]:
+    """Return where the true motion, from the fault until then, was not the one that was asked for.
+
+    For `blind_s` nobody sees the stage: the drive keeps its force, while magnets and cables change theirs.
+    """
     seen = facts.seen
     at, end = (int(np.searchsorted(seen["t_ns"], t_ns)) for t_ns in (facts.fault_t_ns, until_t_ns))
     found = []
     fastest = float(np.abs(seen["macro_velocity_m_per_s"][at:end]).max(initial=0.0))
-    allowed = GAIN_SHARE * facts.planned_m_per_s + of.kick_m_per_s
+    allowed = GAIN_SHARE * facts.planned_m_per_s + of.kick_m_per_s + of.drift_m_per_s2 * blind_s
     if facts.planned_m_per_s > 0.0 and not fastest <= allowed:
         found.append(f"macro was {fastest:.3f} m/s fast, asked for were {facts.planned_m_per_s:.3f}")
     if facts.phase not in _KEPT:
@@ -40,6 +45,7 @@ def astray(facts: Facts, columns: dict[str, np.ndarray], until_t_ns: int, of: Me
         error_m = true_m - setpoint_m
         error_m = np.abs(error_m[rows] - error_m[np.flatnonzero(begins)[0]])  # the reference has its own zero
         limit_m = of.error_limit_m + facts.planned_m_per_s * (NOTICED_S + facts.late_s)
+        limit_m += 0.5 * of.drift_m_per_s2 * blind_s**2
         worst_m = float(error_m.max(initial=0.0))
         if not worst_m <= limit_m:
             found.append(f"end was {worst_m * 1e6:.0f} um from its reference, allowed {limit_m * 1e6:.0f}")

@@ -7,6 +7,8 @@ from stagectl import jogging
 from stagectl import trajectory as trajectories
 from stagectl.backend import BatchBackend
 from stagectl.errors import RequestError
+from stagectl.motion import check, planned_limits
+from stagectl.profile import load_profile
 from stagectl.record import read_run
 from stagectl.replay import replay
 from stagectl.requests import Phase
@@ -104,6 +106,27 @@ def test_a_splice_goes_on_where_the_old_way_is_then():
     last = under_way[at_row - 1]
     assert rows["position_m"][0] - last["position_m"] == pytest.approx(last["velocity_m_per_s"] * DT_S, abs=1e-6)
     assert jogging.splice(under_way, under_way.size - 10, -0.1, LIMITS, TRAVEL_M, DT_S) is None
+
+
+@pytest.mark.parametrize("end", [0, 1])
+@pytest.mark.parametrize(
+    "wanted", [0.0, 0.05, -0.17]
+)  # let go, slower, the other way: as a share of the first way's sign
+@pytest.mark.parametrize("name", ["oled-printer", "single-axis"])
+def test_a_mind_that_changes_shortly_before_the_end_of_travel_leaves_it_not(name, wanted, end):
+    """The way to rest from a row of one that ends at the limit ended 1e-17 m beyond it, and the jog was refused."""
+    profile = load_profile(name)
+    limits, travel_m = planned_limits(profile), profile.macro.travel_m
+    towards = 1.0 if end else -1.0
+    start = trajectories.MotionState(travel_m[end] - 0.1 * towards)
+    under_way = jogging.way(start, 0.17 * towards, limits, travel_m, DT_S).setpoints
+    taken_count = 0
+    for done_rows in range(under_way.size):
+        spliced = jogging.splice(under_way, done_rows, wanted * towards, limits, travel_m, DT_S)
+        if spliced is not None:
+            check(spliced[1], profile)
+            taken_count += 1
+    assert taken_count > 0.2 * under_way.size  # far from the end it is taken at once
 
 
 @pytest.mark.parametrize("velocity", [0.41, -0.41, float("nan"), float("inf")])
