@@ -67,7 +67,7 @@ _DRIVE_HOMES = (Phase.HOMING_DRIVE, Phase.HOMED_DRIVE)
 """The start of its homing stays set while the drive holds the index: a second edge would search again."""
 
 _HELD_S, _HELD_M = 0.02, 1e-4
-"""How far the macro may be from where its drive held it that time ago: 5 mm/s, twenty times what settling shows."""
+"""How far a macro may be from where its drive held it that long before: settled, it moves 1.4 um (three machines)."""
 _ATTAINED_S = 0.05  # in which a drive counts from its index on, and settles there
 
 RELEASE_CYCLES = 100
@@ -589,8 +589,8 @@ class Servo:
         if homed and not self._holds_index((t_ns - self._phase_since_t_ns) * 1e-9):
             moved_m = abs(seen.macro_encoder_m - self._held_m)
             text = (
-                f"the macro's drive held its index, and moved {moved_m * 1e6:.0f} um within {_HELD_S * 1e3:g} ms, limit "
-                f"{_HELD_M * 1e6:g} um; see who else writes to the drive, its mode say, and what pushes the macro"
+                f"the macro's drive held its index, and moved {moved_m * 1e6:.0f} um within {_HELD_S * 1e3:g} ms, "
+                f"limit {_HELD_M * 1e6:g} um; see who else writes to the drive, its mode say, and what pushes the macro"
             )
             self._end(Stop.FOLLOWING_ERROR, Phase.QUICK_STOP, t_ns, text)
             return cia402.State.QUICK_STOP_ACTIVE, off
@@ -616,7 +616,7 @@ class Servo:
         moved_m = encoder_m - self._held_m
         if not abs(moved_m) <= _HELD_M:
             return False
-        self._held_m += self._period_s / _HELD_S * moved_m
+        self._held_m += min(self._period_s / _HELD_S, 1.0) * moved_m
         return True
 
     def _controlword(self, statusword: int, target: cia402.State) -> int:
