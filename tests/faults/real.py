@@ -39,6 +39,7 @@ _PHASES = {  # for how long a fault may wait in each, and how often one is drawn
 _IN_TURN = {"client vanishes": ("jogging", "at rest", "jogging", "jogging", "moving")}  # mostly what it is there for
 _TOUCHING_S = 2.0  # of a homing with a micro
 _REST_S, _OVER_S, _NEVER_RESTS_S = 0.2, 0.6, 10.0
+_SEEN_TO_REST_S, _LOOKS_AGAIN_S = 0.05, 0.5  # its power may go 0.1 s after it came to rest; then it rolls
 _ENDS_S = 30.0  # a motion that goes on; a homing with a micro takes 15 s
 _TRIES = 3
 _GONE = "the rig was gone before its macro rested: what it did there is unknown"
@@ -230,16 +231,16 @@ def _watched(house: House, scenario: Scenario, before: dict) -> float:
     """Follow the true motion until the fault must have had its effect, and the macro rests.
 
     A motion that may go on goes on to its own end; a jog's key is let go of for it. Of a fault that must stop it, what
-    the rig saw is fetched as soon as the macro rests, and no sooner: a service that lost its servo lets go of that
-    world, and the rig goes with it; but to write it all holds the rig up for 20 ms. Returns for how long the rig was
-    held up until the fault must have been noticed, in s: what it was later is no excuse.
+    the rig saw is fetched as soon as the macro rests, and no sooner, then again and again: a service that lost its
+    servo lets go of that world, and the rig goes with it; but to write it all holds the rig up for 20 ms. Returns for
+    how long the rig was held up until the fault must have been noticed, in s: what it was later is no excuse.
     """
     fault = scenario.fault.drawn
     detection_s = fault.detection_s if np.isfinite(fault.detection_s) else 0.0
     least_s = max(fault.lasts_s, detection_s) + _OVER_S
     longest_s = least_s + (_NEVER_RESTS_S if fault.must_stop else _ENDS_S)
     rests_not = MACRO in fault.without_power or scenario.phase == "idle"
-    begin_s, rested_s, kept = time.monotonic(), 0.0, False
+    begin_s, rested_s, kept_s = time.monotonic(), 0.0, 0.0
     before_ns, held_up_s, noticed = before["held_up_ns"], 0.0, False
     while True:
         try:
@@ -253,9 +254,10 @@ def _watched(house: House, scenario: Scenario, before: dict) -> float:
                 held_up_s = 1e-9 * (state["held_up_ns"] - before_ns)
                 over_s = detection_s + held_up_s if np.isfinite(fault.detection_s) else least_s
                 noticed = rests or watched_s > over_s
-            if rests and fault.must_stop and not kept:
+            stood = bool(rested_s) and now_s - rested_s > _SEEN_TO_REST_S
+            if fault.must_stop and (now_s - kept_s > _LOOKS_AGAIN_S if kept_s else stood):
                 house.look_back()
-                kept = True
+                kept_s = time.monotonic()
             if watched_s > least_s and not fault.must_stop:
                 house.let_go()
             if (watched_s > least_s and (rests or rests_not)) or watched_s > longest_s:
@@ -263,7 +265,7 @@ def _watched(house: House, scenario: Scenario, before: dict) -> float:
                     house.look_back()
                 return held_up_s
         except LinkError:
-            if not kept:
+            if not kept_s:
                 raise HostHeldUp(_GONE) from None
             return held_up_s
         time.sleep(LOOK_S)
