@@ -109,9 +109,7 @@ def test_a_splice_goes_on_where_the_old_way_is_then():
 
 
 @pytest.mark.parametrize("end", [0, 1])
-@pytest.mark.parametrize(
-    "wanted", [0.0, 0.05, -0.17]
-)  # let go, slower, the other way: as a share of the first way's sign
+@pytest.mark.parametrize("wanted", [0.0, 0.05, -0.17])  # let go, slower, the other way
 @pytest.mark.parametrize("name", ["oled-printer", "single-axis"])
 def test_a_mind_that_changes_shortly_before_the_end_of_travel_leaves_it_not(name, wanted, end):
     """The way to rest from a row of one that ends at the limit ended 1e-17 m beyond it, and the jog was refused."""
