@@ -35,7 +35,7 @@ SERVO_PARAMETERS = np.dtype(
         ("index_pitch_m", "f8"),  # distance of further marks; 0 = one mark only
         ("bandwidth_rad_per_s", "f8"),
         ("observer_rad_per_s", "f8"),
-        ("mass_per_constant", "f8"),  # kg A / N: current for an acceleration of 1 m/s^2
+        ("mass_per_constant", "f8"),  # kg A / N, own and carried: current for an acceleration of 1 m/s^2
         ("homing_error_limit_m", "f8"),
     ]
 )
@@ -78,7 +78,8 @@ def parameters(axis, bandwidth_hz: float = 20.0) -> np.ndarray:
     p["index_pitch_m"] = getattr(axis, "index_pitch_m", None) or 0.0
     p["bandwidth_rad_per_s"] = 2.0 * np.pi * bandwidth_hz
     p["observer_rad_per_s"] = 2.0 * np.pi * 150.0
-    p["mass_per_constant"] = axis.mass_kg / axis.force_constant_n_per_a
+    moved_kg = axis.mass_kg + (getattr(axis, "commissioned_load_kg", None) or 0.0)
+    p["mass_per_constant"] = moved_kg / axis.force_constant_n_per_a
     p["homing_error_limit_m"] = 5e-3
     return p
 

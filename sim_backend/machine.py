@@ -82,6 +82,7 @@ class MacroMotor(Motor):
     encoder_offset_m: Length
     index_position_m: Length
     index_pitch_m: Annotated[float, above(0.0, 10.0)] | None = None  # of further index marks
+    commissioned_load_kg: Annotated[float, within(0.0, 1e5)] = 0.0  # what its drive was told that moves with it
     travel_m: tuple[Length, Length]
 
     @model_validator(mode="after")

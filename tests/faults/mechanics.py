@@ -46,9 +46,13 @@ class Mechanics:
 
     @property
     def drive_gives_m(self) -> float:
-        """How far the macro's drive gives way under its greatest force while it holds on its encoder: F / (m w^2)."""
-        w = float(drive_servo.parameters(self.machine.macro)["bandwidth_rad_per_s"][0])
-        return self.force_limit_n / (self.machine.macro.mass_kg * w * w)
+        """How far the macro's drive gives way under its greatest force while it holds on its encoder: F / (m w^2).
+
+        m is the mass that the drive was told.
+        """
+        drive = drive_servo.parameters(self.machine.macro)[0]
+        told_kg = drive["mass_per_constant"] * self.machine.macro.force_constant_n_per_a
+        return float(self.force_limit_n / (told_kg * drive["bandwidth_rad_per_s"] ** 2))
 
     @property
     def kick_m_per_s(self) -> float:
