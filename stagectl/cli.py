@@ -83,6 +83,14 @@ Profile = Annotated[
     str, _option("Profile: a name or a TOML file.", "--profile", "-p", metavar="NAME", envvar="STAGECTL_PROFILE")
 ]
 Wire = Annotated[str, _option(f"auto | hardware | rig. {_AUTO}.", "--backend", metavar="WORLD")]
+DemoWorld = Annotated[
+    str | None,
+    _option(
+        "auto | hardware | rig | batch. Without it: the rig, in virtual time (batch) where this host can't keep 1 kHz.",
+        "--backend",
+        metavar="WORLD",
+    ),
+]
 WireOrPlant = Annotated[
     str,
     _option(
@@ -218,7 +226,11 @@ def _root(version: Version = False) -> None:
 
 @app.command(epilog=_epilog("stagectl demo", "stagectl demo --json --runs /tmp/runs"))
 def demo(
-    profile: Profile = _PROFILE, backend: Wire = "rig", seed: Seed = 1, runs: Runs = _RUNS, json: Json = False
+    profile: Profile = _PROFILE,
+    backend: DemoWorld = None,
+    seed: Seed = 1,
+    runs: Runs = _RUNS,
+    json: Json = False,
 ) -> None:
     """Home, identify the backlash, follow the same trajectory under PID and under DSMC; table, figures, report."""
     _deliver("demo", json, lambda voice: commands.demo.show(voice, profile, backend, runs, seed))

@@ -4,6 +4,7 @@ Drives a supervisor object and returns what happened; prints nothing and writes 
 from the run (`stagectl.run_scores`) and shown by `stagectl.run_page`.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -43,16 +44,36 @@ class Trip:
 
 
 @dataclass(frozen=True, slots=True)
+class Host:
+    """How many of its cycles the host missed since its servo started, and which share of them is borne."""
+
+    cycles_count: int
+    missed_cycles_count: int
+    bears_ratio: float
+
+    @property
+    def missed_ratio(self) -> float:
+        """Share of the cycles that were missed."""
+        return self.missed_cycles_count / max(self.cycles_count, 1)
+
+
+@dataclass(frozen=True, slots=True)
 class Driven:
     """What the stage did: every motion's last outcome in order, and what had to be repeated."""
 
     outcomes: tuple[Outcome, ...]
     trips: tuple[Trip, ...]
+    host: "Host"
 
     @property
     def stop(self) -> Stop:
         """FINISHED where every motion came to its own end, else why the last one did not."""
         return self.outcomes[-1].stop
+
+    @property
+    def given_up(self) -> bool:
+        """Whether it ended because the host missed more cycles than it was asked to bear."""
+        return not self.host.missed_ratio <= self.host.bears_ratio
 
 
 def planned(profile: Profile, dwell_s: float = DWELL_S) -> trajectories.Trajectory:
@@ -75,17 +96,19 @@ def drive(
     laws: Sequence[str] = LAWS,
     identify_s: float = 20.0,
     say: Say = lambda text: None,
+    bears_missed_ratio: float = math.inf,
 ) -> Driven:
     """Home, identify, follow the trajectory under each law; a motion that the guard ended is repeated once.
 
-    Ends at the first motion that fails twice. `say` hears what had to be repeated, when it happens.
+    Ends at the first motion that fails twice, or behind which the host has missed more than `bears_missed_ratio` of its
+    cycles. `say` hears what had to be repeated, when it happens.
     """
-    flow = _Flow(stage, say)
+    flow = _Flow(stage, say, bears_missed_ratio)
     if flow.does("home", stage.home) and _identifies(flow, stage, identify_s):
         for law in laws:
             if not flow.does(f"{trajectory.name} under {law}", lambda law=law: _follow(stage, trajectory, law)):
                 break
-    return Driven(tuple(flow.outcomes), tuple(flow.trips))
+    return Driven(tuple(flow.outcomes), tuple(flow.trips), flow.host())
 
 
 def _identifies(flow: "_Flow", stage: Supervisor, duration_s: float) -> bool:
@@ -113,15 +136,15 @@ def _armed(stage: Supervisor, motion: Callable[[], Outcome], law: str | None = N
 class _Flow:
     """Does one motion after the other and keeps how each ended."""
 
-    def __init__(self, stage: Supervisor, say: Say):
-        self._stage, self._say = stage, say
+    def __init__(self, stage: Supervisor, say: Say, bears_missed_ratio: float):
+        self._stage, self._say, self._bears_ratio = stage, say, bears_missed_ratio
         self.outcomes: list[Outcome] = []
         self.trips: list[Trip] = []
 
     def does(self, name: str, motion: Callable[[], Outcome]) -> bool:
         """Move, once more where the guard ended it; tells whether the motion came to its own end."""
         outcome = motion()
-        if not outcome.finished:
+        if not outcome.finished and not self._host_is_late:
             trip = Trip(name, outcome)
             self.trips.append(trip)
             self._say(f"{trip.text}; acknowledging, arming again and repeating it once")
@@ -129,4 +152,13 @@ class _Flow:
             if outcome.stop is not Stop.REFERENCE_LOST or name == "home" or self._stage.home().finished:
                 outcome = motion()
         self.outcomes.append(outcome)
-        return outcome.finished
+        return outcome.finished and not self._host_is_late
+
+    def host(self) -> Host:
+        """Return what the host missed until now."""
+        missed_count = int(self._stage.status()["missed_cycles"])
+        return Host(self._stage.recorder.rows_count + missed_count, missed_count, self._bears_ratio)
+
+    @property
+    def _host_is_late(self) -> bool:
+        return self.host().missed_ratio > self._bears_ratio

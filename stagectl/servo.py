@@ -68,6 +68,7 @@ _DRIVE_HOMES = (Phase.HOMING_DRIVE, Phase.HOMED_DRIVE)
 
 _HELD_S, _HELD_M = 0.02, 1e-4
 """How far a macro may be from where its drive held it that long before: settled, it moves 1.4 um (three machines)."""
+_STARTS_S = 0.05  # in which a drive takes back the bits of a search before this one
 _ATTAINED_S = 0.05  # in which a drive counts from its index on, and settles there
 
 RELEASE_CYCLES = 100
@@ -594,7 +595,7 @@ class Servo:
             )
             self._end(Stop.FOLLOWING_ERROR, Phase.QUICK_STOP, t_ns, text)
             return cia402.State.QUICK_STOP_ACTIVE, off
-        if not homed and state is on and (t_ns - self._phase_since_t_ns) * 1e-9 > 0.05:
+        if not homed and state is on and (t_ns - self._phase_since_t_ns) * 1e-9 > _STARTS_S:
             progress = cia402.homing_of(seen.macro_statusword)
             if progress is cia402.Homing.ATTAINED:
                 self._enter(Phase.HOMED_DRIVE, t_ns)

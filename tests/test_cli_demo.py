@@ -234,6 +234,39 @@ def test_a_stop_between_two_motions_is_the_end_of_the_second(tmp_path):
     assert ended.text == "the lease on motion ran out: for a test"
 
 
+def driven_on_a_late_host(folder, **options):
+    """Drive the short demo where every tick takes 1.02 ms of a cycle's 1 ms, so that every other cycle is missed."""
+    profile = load_profile("oled-printer")
+    with Supervisor(profile, BatchBackend(load_machine("oled-printer"), seed=1, tick_s=1.02e-3), folder) as stage:
+        plan = trapezoid(0.05, 0.1, dwell_s=0.3, start_m=0.0, lead_s=0.3)
+        return demo.drive(stage, plan, ("dsmc",), identify_s=4.0, **options)
+
+
+def test_a_host_that_misses_more_than_is_borne_ends_the_demo(tmp_path):
+    driven = driven_on_a_late_host(tmp_path / "given-up", bears_missed_ratio=1e-3)
+    assert driven.given_up
+    assert [one.name for one in driven.outcomes] == ["home"]
+    assert driven.host.missed_ratio == pytest.approx(0.5, abs=0.01)
+    assert driven.host.cycles_count == pytest.approx(2 * driven.outcomes[0].rows, rel=0.05)
+    borne = driven_on_a_late_host(tmp_path / "borne")
+    assert not borne.given_up
+    assert borne.host.missed_ratio > 1e-3
+
+
+@pytest.mark.real_time
+def test_the_demo_comes_to_its_end_on_any_host(tmp_path):
+    """In real time where this host can, else in virtual time; never silently."""
+    command = [sys.executable, "-m", "stagectl.cli", "demo", "--runs", str(tmp_path), "--json"]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=400)
+    assert process.returncode == 0, process.stderr
+    answer = json.loads(process.stdout)
+    real_time = answer["real_time"]
+    assert answer["cycle"]["is_virtual"] == real_time["given_up"] == (real_time["missed_ratio"] > 1e-3)
+    assert (real_time["run"] == answer["run"]) != real_time["given_up"]
+    assert ("the demo plays in virtual time" in process.stderr) == real_time["given_up"]
+    assert read_manifest(Path(real_time["run"]))["backend"] == "rig"
+
+
 # ---- what else is done with its run ----
 
 

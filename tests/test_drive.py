@@ -5,6 +5,7 @@ import struct
 import numpy as np
 import pytest
 
+from sim_backend import drive_servo
 from sim_backend.drive_states import STATUSWORD, DriveState, next_state
 from sim_backend.machine import Start, load_machine
 from sim_backend.rig import Rig
@@ -356,6 +357,30 @@ def test_quick_stop_follows_its_ramp_and_holds(bench):
     assert bench.rig.plant_state()["macro_position_m"] - begin == pytest.approx(distance, abs=0.3e-3)
     assert bench.read(1, 0x6041) & 0x6F == 0x07
     assert bench.read(1, 0x6041) & 0x0400  # reached standstill
+
+
+def way_beyond_ramp_m(macro):
+    """How far a macro with 40 kg that go with it rigidly swings beyond its ramp of 2 m/s^2 from 0.1 m/s."""
+    told = drive_servo.parameters(macro)
+    servo = drive_servo.init(told, 0.0)
+    position_m, velocity, dt_s = 0.0, 0.1, 62.5e-6
+    servo["velocity_m_per_s"], servo["ramp_m_per_s2"], servo["current_limit_a"] = velocity, 2.0, 20.0
+    drive_servo.enter(servo, drive_servo.STOPPING)
+    furthest_m = 0.0
+    for _ in range(4000):
+        drive_servo.step(servo, told, position_m, dt_s)
+        force_n = macro.force_constant_n_per_a * float(servo["current_command_a"][0])
+        velocity += force_n / (macro.mass_kg + 40.0) * dt_s
+        position_m += velocity * dt_s
+        furthest_m = max(furthest_m, position_m)
+    return furthest_m - 0.1**2 / (2.0 * 2.0)
+
+
+def test_a_drive_that_was_told_its_load_follows_its_ramp():
+    macro = load_machine("oled-printer").macro
+    assert macro.commissioned_load_kg == 40.0
+    assert abs(way_beyond_ramp_m(macro)) < 20e-6
+    assert way_beyond_ramp_m(macro.model_copy(update={"commissioned_load_kg": 0.0})) > 80e-6
 
 
 def test_quick_stop_option_2_ends_without_power(bench):

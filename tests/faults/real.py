@@ -187,7 +187,8 @@ def _play(house: House, scenario: Scenario) -> Facts | str:
     facts.fault_t_ns = house.t_ns()
     assert drawn_fault.act is not None
     drawn_fault.act(house)
-    held_up_s = _watched(house, scenario, before)
+    watch = _Watch(scenario, before)
+    held_up_s = _seen_to_stop(house, watch) if drawn_fault.must_stop else _seen_to_end(house, watch)
     house.let_go()
     if drawn_fault.must_stop:
         facts.judged_until_t_ns = int(house.seen["t_ns"][-1])
@@ -227,47 +228,77 @@ def _name_fault(house: House, scenario: Scenario, facts: Facts) -> None:
         facts.fault_kind, facts.fault_text = fault.kind, fault.values
 
 
-def _watched(house: House, scenario: Scenario, before: dict) -> float:
-    """Follow the true motion until the fault must have had its effect, and the macro rests.
+class _Watch:
+    """The true motion since a fault: for how long the macro rests, and what the rig was held up until it was noticed.
 
-    A motion that may go on goes on to its own end; a jog's key is let go of for it. Of a fault that must stop it, what
-    the rig saw is fetched as soon as the macro rests, and no sooner, then again and again: a service that lost its
-    servo lets go of that world, and the rig goes with it; but to write it all holds the rig up for 20 ms. Returns for
-    how long the rig was held up until the fault must have been noticed, in s: what it was later is no excuse.
+    What the rig was held up later is no excuse for anything.
     """
-    fault = scenario.fault.drawn
-    detection_s = fault.detection_s if np.isfinite(fault.detection_s) else 0.0
-    least_s = max(fault.lasts_s, detection_s) + _OVER_S
-    longest_s = least_s + (_NEVER_RESTS_S if fault.must_stop else _ENDS_S)
-    rests_not = MACRO in fault.without_power or scenario.phase == "idle"
-    begin_s, rested_s, kept_s = time.monotonic(), 0.0, 0.0
-    before_ns, held_up_s, noticed = before["held_up_ns"], 0.0, False
+
+    def __init__(self, scenario: Scenario, before: dict) -> None:
+        """Begin at the fault; `before`: the rig's state there."""
+        fault = scenario.fault.drawn
+        self._detection_s = fault.detection_s
+        self._must_be_over_s = (fault.detection_s if np.isfinite(fault.detection_s) else 0.0) + _OVER_S
+        self.least_s = max(fault.lasts_s + _OVER_S, self._must_be_over_s)
+        self._need_not_rest = MACRO in fault.without_power or scenario.phase == "idle"
+        self._begin_s, self._before_ns = time.monotonic(), before["held_up_ns"]
+        self._rested_s, self._noticed = 0.0, False
+        self.held_up_s = self.watched_s = self.rests_s = 0.0
+
+    def look(self, house: House) -> None:
+        """Ask the rig; LinkError where it is gone."""
+        state = house.state()
+        now_s = time.monotonic()
+        slow = abs(state["plant"]["macro_velocity_m_per_s"]) < REST_M_PER_S
+        self._rested_s = (self._rested_s or now_s) if slow else 0.0
+        self.rests_s = now_s - self._rested_s if slow else 0.0
+        self.watched_s = now_s - self._begin_s
+        if not self._noticed:
+            self.held_up_s = 1e-9 * (state["held_up_ns"] - self._before_ns)
+            over_s = self._detection_s + self.held_up_s if np.isfinite(self._detection_s) else self.least_s
+            self._noticed = self.rests_s > _REST_S or self.watched_s > over_s
+
+    def is_over(self, patience_s: float) -> bool:
+        """Tell whether the fault had its effect and the macro rests, or has not for that long."""
+        settled = self.rests_s > _REST_S or self._need_not_rest
+        return (self.watched_s > self.least_s and settled) or self.watched_s > self.least_s + patience_s
+
+
+def _seen_to_stop(house: House, watch: _Watch) -> float:
+    """Follow a motion that the fault must stop; return for how long the rig was held up until it was noticed, in s.
+
+    What the rig saw is fetched as soon as the macro rests, and no sooner, then again and again: a service that lost its
+    servo lets go of that world, and the rig goes with it; but to write it all holds the rig up for 20 ms.
+    """
+    kept_s = 0.0
     while True:
         try:
-            state = house.state()
-            now_s = time.monotonic()
-            slow = abs(state["plant"]["macro_velocity_m_per_s"]) < REST_M_PER_S
-            rested_s = (rested_s or now_s) if slow else 0.0
-            rests = bool(rested_s) and now_s - rested_s > _REST_S
-            watched_s = now_s - begin_s
-            if not noticed:
-                held_up_s = 1e-9 * (state["held_up_ns"] - before_ns)
-                over_s = detection_s + held_up_s if np.isfinite(fault.detection_s) else least_s
-                noticed = rests or watched_s > over_s
-            stood = bool(rested_s) and now_s - rested_s > _SEEN_TO_REST_S
-            if fault.must_stop and (now_s - kept_s > _LOOKS_AGAIN_S if kept_s else stood):
+            watch.look(house)
+            over = watch.is_over(_NEVER_RESTS_S)
+            again = time.monotonic() - kept_s > _LOOKS_AGAIN_S if kept_s else watch.rests_s > _SEEN_TO_REST_S
+            if over or again:
                 house.look_back()
                 kept_s = time.monotonic()
-            if watched_s > least_s and not fault.must_stop:
-                house.let_go()
-            if (watched_s > least_s and (rests or rests_not)) or watched_s > longest_s:
-                if fault.must_stop:
-                    house.look_back()
-                return held_up_s
+            if over:
+                return watch.held_up_s
         except LinkError:
             if not kept_s:
                 raise HostHeldUp(_GONE) from None
-            return held_up_s
+            return watch.held_up_s
+        time.sleep(LOOK_S)
+
+
+def _seen_to_end(house: House, watch: _Watch) -> float:
+    """Follow a motion that may go on to its own end, for which a jog's key is let go of; return as `_seen_to_stop`."""
+    while True:
+        try:
+            watch.look(house)
+            if watch.watched_s > watch.least_s:
+                house.let_go()
+            if watch.is_over(_ENDS_S):
+                return watch.held_up_s
+        except LinkError:
+            raise HostHeldUp(_GONE) from None
         time.sleep(LOOK_S)
 
 
