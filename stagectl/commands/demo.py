@@ -20,7 +20,7 @@ from stagectl.trajectory import Trajectory
 REPORT = "report.html"
 
 _BEARS_MISSED_RATIO = 1e-3
-"""A stage PC misses none. At 1.2 %, on a shared machine, homing failed in two of four plays, and DSMC erred by 41 um."""
+"""A stage PC misses none. At 1.2 % and more, on a shared machine, homing failed in two of four plays."""
 
 
 def show(voice: Voice, profile: str, backend: str | None, runs_root: Path, seed: int) -> Answer:
@@ -78,8 +78,9 @@ def _driven(
 
 
 def _given_up_text(host: demo.Host, folder: Path) -> str:
+    missed_percent, borne_percent = 100.0 * host.missed_ratio, 100.0 * host.bears_ratio
     return (
-        f"this host missed {host.missed_cycles_count} of {host.cycles_count} cycles ({100.0 * host.missed_ratio:.2g} %, "
-        f"limit {100.0 * host.bears_ratio:.2g} %), and no law helps a stage whose commands come late; the demo plays in "
-        f"virtual time, over the same bytes (in real time whatever happens: --backend rig; its run: {folder})"
+        f"this host missed {host.missed_cycles_count} of {host.cycles_count} cycles ({missed_percent:.2g} %, limit "
+        f"{borne_percent:.2g} %), and no law helps a stage whose commands come late; the demo plays in virtual time, over "
+        f"the same bytes (in real time whatever happens: --backend rig; its run: {folder})"
     )
