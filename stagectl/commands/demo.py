@@ -81,6 +81,6 @@ def _given_up_text(host: demo.Host, folder: Path) -> str:
     missed_percent, borne_percent = 100.0 * host.missed_ratio, 100.0 * host.bears_ratio
     return (
         f"this host missed {host.missed_cycles_count} of {host.cycles_count} cycles ({missed_percent:.2g} %, limit "
-        f"{borne_percent:.2g} %), and no law helps a stage whose commands come late; the demo plays in virtual time, over "
-        f"the same bytes (in real time whatever happens: --backend rig; its run: {folder})"
+        f"{borne_percent:.2g} %), and no law helps a stage whose commands come late; the demo plays in virtual time, "
+        f"over the same bytes (in real time whatever happens: --backend rig; its run: {folder})"
     )
