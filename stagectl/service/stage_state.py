@@ -64,6 +64,7 @@ class StageState:
         self._backend = ""  # as `auto` was resolved, once
         self._stage: Supervisor | None = None
         self._state, self._since = State.OFF, now_text()
+        self._stopped_in: State | None = None  # what a stage that stops by itself was doing
         self._fault: messages.Fault | None = None
         self._waiting_for = "the service has just begun"
         self._retry_at_s = 0.0
@@ -150,6 +151,7 @@ class StageState:
     def _enter(self, event: Event, text: str = "") -> None:
         before, self._state = self._state, states.after(self._state, event)
         if before is not self._state:
+            self._stopped_in = None
             self._since = now_text()
             self._log.say("state", text, state=self._state.value, before=before.value, because=event.value)
             self._notifier.say(STATUS=f"{self._state.value}, {self._backend or 'no world'}")
@@ -176,12 +178,19 @@ class StageState:
         self._log.say("fault", fault.what, **fault.model_dump(exclude={"what", "at"}))
         self._figures.fault(fault.kind)
 
-    def _trip_by(self, stop: Stop, stage: Supervisor, stopped_in: State | None = None) -> None:
-        state = stopped_in or self._state
+    def _stop_by_itself(self) -> None:
+        """Have all see that the stage stops, before it stands and can say why."""
+        before = self._state
+        self._enter(Event.STOP, "it stops by itself")
+        self._stopped_in = before
+
+    def _trip_by(self, stop: Stop, stage: Supervisor) -> None:
+        state = self._stopped_in or self._state
         self._trip(faults.of_stop(stop, stage.detail, state, now_text(), self._memory.next_fault_number))
 
     def _fault_of(self, error: StagectlError) -> messages.Fault:
-        return faults.of_error(error, self._state, now_text(), self._memory.next_fault_number)
+        state = self._stopped_in or self._state
+        return faults.of_error(error, state, now_text(), self._memory.next_fault_number)
 
     def _say_not_kept(self, text: str) -> None:
         self._log.say("state_not_kept", text)

@@ -32,8 +32,8 @@ class StageWatch(StageWorld):
 
     def _wait_until_it_stands(self) -> None:
         """Let a stage that stops by itself do so, for all to see; then say why."""
-        stage, before = self._stage, self._state
-        self._enter(Event.STOP, "it stops by itself")
+        stage = self._stage
+        self._stop_by_itself()
         until_s = time.monotonic() + 30.0
         try:
             while stage is not None and stage.status()["phase"] != Phase.STOPPED and time.monotonic() < until_s:
@@ -42,10 +42,10 @@ class StageWatch(StageWorld):
         except StagectlError as error:
             self._break(error)
             return
-        self._settle(stopped_in=before)
+        self._settle()
 
-    def _settle(self, name: str = "", stopped_in: State | None = None) -> None:
-        """Bring the state into line with the servo's phase, after a motion or a stop that began in `stopped_in`."""
+    def _settle(self, name: str = "") -> None:
+        """Bring the state into line with the servo's phase, after a motion or a stop."""
         stage = self._stage
         if stage is None:
             return
@@ -54,7 +54,7 @@ class StageWatch(StageWorld):
         if phase is Phase.TRACKING and self._state is not State.STOPPING:
             self._enter(Event.HELD, name)
         elif phase is Phase.STOPPED and stop is not Stop.OPERATOR:
-            self._trip_by(stop, stage, stopped_in)
+            self._trip_by(stop, stage)
         else:
             self._rest(name)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from stagectl.errors import LinkError, ProfileError, RequestError, StagectlError
 from stagectl.profile import Profile, load_profile
+from stagectl.requests import Phase
 from stagectl.run_folder import give_back
 from stagectl.service import states
 from stagectl.service.scope import Scope
@@ -15,12 +16,16 @@ from stagectl.service.states import Event, State
 from stagectl.service.view import BANNERS
 from stagectl.service.wear_watch import WearWatch
 from stagectl.service.world import missing
+from stagectl.signals import Stop
 from stagectl.stage import choose, open_stage
 
 _RETRY_S, _RETRY_AFTER_FAILURE_S = 2.0, 5.0
 _CONNECT_S = 240.0  # a cold compile cache on a slow host
 _CLOSE_S = 60.0  # coming to rest, rows to the disk
 _OPENING = "opening the stage"
+_STOPS = (Phase.STOPPING, Phase.GUIDED_STOP, Phase.QUICK_STOP)
+_AS_ASKED = (Stop.NONE, Stop.OPERATOR, Stop.FINISHED, Stop.HOMING_GIVEN_UP)
+"""A search that found no index on this side goes on on the other."""
 ENDING = "the service was asked to end"
 """Why the stage comes to rest at the service's end."""
 
@@ -195,4 +200,8 @@ class StageWorld(StageState):
             if states.TRANSITIONS.get((self._state, Event.STOP)) is not None:
                 self._enter(Event.STOP, ENDING if self._leaving else self.desk.stop_reason)
             self._stage.ask_to_stop()
+        elif self._stage is not None and not self._opening and self._state in (State.MOVING, State.IDENTIFYING):
+            status = self._stage.status()
+            if status["phase"] in _STOPS and status["stop"] not in _AS_ASKED:
+                self._stop_by_itself()
         self._tick()

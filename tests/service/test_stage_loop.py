@@ -326,6 +326,17 @@ def test_a_stage_that_stops_by_itself_is_shown_as_stopping_and_its_fault_says_wh
     assert armed.status.fault.state == "armed"
 
 
+def test_so_is_one_that_stops_in_a_motion_while_it_does(armed):
+    """The frames of the macro's drive are lost: it is not seen to stand, and the fault is told seconds later."""
+    backend = armed.loop._stage.backend
+    silence = Fault("drop_frame", can_id=0x181, at_s=0.0, duration_s=1.0)
+    backend.rig.inject(silence, backend.wire.t_ns + 300_000_000)
+    assert armed.do("move", messages.Move(target_m=0.06)).stop == "LINK_SILENT"
+    states = [entry.fields["state"] for entry in armed.log.last(40) if entry.event == "state"]
+    assert states[-3:] == ["moving", "stopping", "fault"]
+    assert armed.status.fault.state == "moving"
+
+
 def test_what_is_said_to_a_jog_that_was_let_go_of_moves_nothing(armed):
     desk, token = armed.desk, armed.token
     velocity = messages.JogAt(velocity_m_per_s=0.05)

@@ -487,11 +487,15 @@ def test_one_walk_takes_every_transition_of_the_table(tmp_path):
     assert w.do("identify").stop == "OPERATOR"  # identifying -> stopping
     w.recover()
     w.later(3, lambda: w.strike("beam breaks"))
-    assert w.do("identify").stop == "REFERENCE_LOST"  # identifying -> fault
+    assert w.do("identify").stop == "REFERENCE_LOST"  # identifying -> stopping -> fault
     w.recover()  # fault -> idle
     w.later(10, lambda: w.strike("something in the way"))
-    assert w.do("move back").stop == "MICRO_STROKE"  # moving -> fault
+    assert w.do("move back").stop == "MICRO_STROKE"  # moving -> stopping -> fault
     w.recover()
+    for name in ("identify", "move back"):
+        w.later(10, w.lose_servo)
+        assert w.do(name).error.kind == "LinkError"  # identifying, moving -> fault
+        w.recover()
     w.strike("emergency")
     w.until(State.FAULT)  # armed -> stopping -> fault
     w.stop()
