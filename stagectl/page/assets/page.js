@@ -14,7 +14,8 @@ const RUN_CLOSES_MS = 1500; // after a run ended its file is closed
 
 const byId = (id) => document.getElementById(id);
 const write = (id, text) => { const place = byId(id); if (place.textContent !== text) place.textContent = text; };
-const number = (value, scale, digits) => (value === null || value === undefined ? '–' : (value * scale).toFixed(digits).replace('-', '−'));
+const signed = (text) => text.replace(/^-(?=[0.]*$)/, '').replace('-', '−'); // what rounds to nothing has no sign
+const number = (value, scale, digits) => (value === null || value === undefined ? '–' : signed((value * scale).toFixed(digits)));
 const twoDigits = (value) => String(value).padStart(2, '0');
 
 // Time of day; the date too where it is not today's.
@@ -74,8 +75,8 @@ function showPositions(status) {
   if (limits) {
     const [low, high] = limits.travel_m;
     showRail('travel', low, high, status.homed ? positions.end_position_m : null, { target: positions.setpoint_position_m });
-    write('travel-low', `${+(low * 1e3).toFixed(3)}`);
-    write('travel-high', `${+(high * 1e3).toFixed(3)} mm`);
+    write('travel-low', signed(`${+(low * 1e3).toFixed(3)}`));
+    write('travel-high', `${signed(`${+(high * 1e3).toFixed(3)}`)} mm`);
     document.body.classList.toggle('no-micro', !limits.has_micro);
   }
   byId('joint').hidden = !backlash;
