@@ -21,6 +21,7 @@ DWELL_S = 1.0
 LONGEST_STROKE_M = 0.8
 SPEED_M_PER_S = 0.2
 _TRAVEL_SHARE = 8.0 / 9.0
+_HICCUP_CYCLES = 10
 
 Say = Callable[[str], None]
 
@@ -56,6 +57,11 @@ class Host:
         """Share of the cycles that were missed."""
         return self.missed_cycles_count / max(self.cycles_count, 1)
 
+    @property
+    def is_late(self) -> bool:
+        """Whether that is more than is borne; a single hiccup says nothing of a host."""
+        return self.missed_cycles_count >= _HICCUP_CYCLES and self.missed_ratio > self.bears_ratio
+
 
 @dataclass(frozen=True, slots=True)
 class Driven:
@@ -73,7 +79,7 @@ class Driven:
     @property
     def given_up(self) -> bool:
         """Whether it ended because the host missed more cycles than it was asked to bear."""
-        return not self.host.missed_ratio <= self.host.bears_ratio
+        return self.host.is_late
 
 
 def planned(profile: Profile, dwell_s: float = DWELL_S) -> trajectories.Trajectory:
@@ -144,7 +150,7 @@ class _Flow:
     def does(self, name: str, motion: Callable[[], Outcome]) -> bool:
         """Move, once more where the guard ended it; tells whether the motion came to its own end."""
         outcome = motion()
-        if not outcome.finished and not self._host_is_late:
+        if not outcome.finished and not self.host().is_late:
             trip = Trip(name, outcome)
             self.trips.append(trip)
             self._say(f"{trip.text}; acknowledging, arming again and repeating it once")
@@ -152,13 +158,9 @@ class _Flow:
             if outcome.stop is not Stop.REFERENCE_LOST or name == "home" or self._stage.home().finished:
                 outcome = motion()
         self.outcomes.append(outcome)
-        return outcome.finished and not self._host_is_late
+        return outcome.finished and not self.host().is_late
 
     def host(self) -> Host:
         """Return what the host missed until now."""
         missed_count = int(self._stage.status()["missed_cycles"])
         return Host(self._stage.recorder.rows_count + missed_count, missed_count, self._bears_ratio)
-
-    @property
-    def _host_is_late(self) -> bool:
-        return self.host().missed_ratio > self._bears_ratio

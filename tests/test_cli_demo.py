@@ -261,7 +261,8 @@ def test_the_demo_comes_to_its_end_on_any_host(tmp_path):
     assert process.returncode == 0, process.stderr
     answer = json.loads(process.stdout)
     real_time = answer["real_time"]
-    assert answer["cycle"]["is_virtual"] == real_time["given_up"] == (real_time["missed_ratio"] > 1e-3)
+    assert answer["cycle"]["is_virtual"] == real_time["given_up"]
+    assert real_time["missed_ratio"] > 1e-3 or not real_time["given_up"]
     assert (real_time["run"] == answer["run"]) != real_time["given_up"]
     assert ("the demo plays in virtual time" in process.stderr) == real_time["given_up"]
     assert read_manifest(Path(real_time["run"]))["backend"] == "rig"
