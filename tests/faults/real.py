@@ -15,10 +15,11 @@ import pytest
 
 from stagectl.errors import LinkError, RecordError, StagectlError
 from stagectl.record import read_run
-from tests.faults.house import IDENTIFY_S, JOG_HOLD_S, LOOK_S, House
+from tests.faults.house import IDENTIFY_S, LOOK_S, House
 from tests.faults.judge import AT_WILL, BACK, BEGUN, COURSE, REST_M_PER_S, Record, judge
 from tests.faults.kinds import MACRO, MICRO, one_of
 from tests.faults.mechanics import mechanics_of
+from tests.faults.operator_program import JOG_HOLD_S
 from tests.faults.real_kinds import KINDS, Real
 from tests.faults.scene import TOP_M_PER_S, Facts
 from tests.small_disk import small_disk
@@ -196,13 +197,17 @@ def _play(house: House, scenario: Scenario) -> Facts | str:
     if not drawn_fault.must_stop:  # behind the question: to write it all holds the rig up, which may stop the stage
         facts.judged_until_t_ns = _seen_until_t_ns(house)
     time.sleep(0.3 if drawn_fault.lasts_s else 0.0)
+    house.go_on_where_it_hung()
     facts.trouble = house.ready()
+    if not facts.trouble:
+        house.find_rig()  # it may be another one
+        _seen_until_t_ns(house)
     until_t_ns = facts.judged_until_t_ns
     if np.isfinite(drawn_fault.detection_s):
         until_t_ns = facts.fault_t_ns + round(1e9 * (drawn_fault.detection_s + held_up_s))
     servo_late_s = house.lateness_s(facts.fault_t_ns, until_t_ns)
     facts.late_s = held_up_s + WAKE_S + (0.0 if scenario.fault.by_drives else servo_late_s)
-    facts.accepted = house.accepted
+    facts.accepted, facts.unasked = house.accepted, house.unasked
     facts.seen = house.seen
     if not drawn_fault.may_stop and facts.fault_kind and held_up_s + servo_late_s > HICCUP_S:
         raise HostHeldUp(f"{facts.fault_kind}, {(held_up_s + servo_late_s) * 1e3:.0f} ms late")
@@ -216,6 +221,7 @@ def _name_fault(house: House, scenario: Scenario, facts: Facts) -> None:
         daemon.start()
         daemon.client.lease_token = ""
         daemon.state_is("idle", "fault")
+        house.note_rest("idle")
         facts.fault_kind = "killed"
         return
     must = scenario.fault.drawn.must_stop and scenario.phase not in AT_WILL
@@ -223,6 +229,7 @@ def _name_fault(house: House, scenario: Scenario, facts: Facts) -> None:
     settled = ("fault",) if must else ("off", "idle", "armed", "fault")
     with contextlib.suppress(AssertionError):
         daemon.state_is(*settled)
+        house.note_rest(daemon.client.status().state)
     fault = daemon.client.fault()
     if fault is not None:
         facts.fault_kind, facts.fault_text = fault.kind, fault.values
