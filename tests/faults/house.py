@@ -5,6 +5,7 @@ It records as profiles do that say nothing of it: from arming to disarming.
 
 import contextlib
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pyarrow as pa
 from stagectl.backend import ask_rig
 from stagectl.errors import RequestError, StagectlError
 from stagectl.service import messages
+from tests.faults.nonsense import Nonsense
 from tests.faults.operator_program import Operator
 from tests.faults.witness import joined, seen_of
 from tests.service.daemon import PATIENT, Daemon
@@ -24,6 +26,7 @@ JOG_M_PER_S = 0.12
 IDENTIFY_S = 4.0
 _PATIENCE_S = 120.0
 _UNDER_WAY_S = 10.0
+_LOG_COUNT = 1000
 _HOME_FROM_M = 0.08  # 0.8 s of search
 
 
@@ -41,7 +44,7 @@ class House:
         self._rests_t_ns = 0  # since when it rests and nothing was asked that gives power; 0: it was
         self._operator: Operator | None = None
         self._hung: Operator | None = None
-        self._channel = ""
+        self.rig_place = ""
 
     def close(self) -> None:
         """End everything."""
@@ -55,11 +58,11 @@ class House:
     def find_rig(self) -> None:
         """Remember where the rig is, so that it can be asked when its service is gone."""
         places = sorted((self.daemon.folder / "tmp").glob("stagectl-rig-*/can.socket"), key=os.path.getmtime)
-        self._channel = str(places[-1])
+        self.rig_place = str(places[-1])
 
     def state(self) -> dict:
         """Ask the rig what is true now."""
-        return ask_rig(self._channel, {"state": True})
+        return ask_rig(self.rig_place, {"state": True})
 
     @staticmethod
     def t_ns() -> int:
@@ -69,7 +72,7 @@ class House:
     def look_back(self) -> dict[str, np.ndarray]:
         """Ask the rig for all that it saw, and keep it, behind what an earlier one saw."""
         path = self.daemon.folder / "seen.npz"
-        ask_rig(self._channel, {"truth": str(path)})
+        ask_rig(self.rig_place, {"truth": str(path)})
         with np.load(path) as stored:
             self.seen = joined(self.seen, seen_of({name: stored[name] for name in stored.files}))
         return self.seen
@@ -81,7 +84,7 @@ class House:
 
     def rig_fault(self, **fault) -> None:
         """Let something go wrong in the rig."""
-        ask_rig(self._channel, {"fault": fault})
+        ask_rig(self.rig_place, {"fault": fault})
 
     # ---- the operator --------------------------------------------------------------------------------------------
 
@@ -193,6 +196,21 @@ class House:
         hung, self._hung = self._hung, None
         if hung is not None and hung.goes_on():
             self.accepted.append("the lease of a client that had hung")
+
+    def edit_profile(self, edited: Nonsense) -> None:
+        """Spoil the profile, and ask for it to be read again."""
+        edited.put(self.daemon.profile)
+        self.daemon.process.send_signal(signal.SIGHUP)
+
+    def take_power_away(self) -> None:
+        """Stop an armed stage, and wait until it has no power: only then is a profile read again."""
+        client = self.daemon.client
+        client.stop()
+        self._until(lambda: client.status().state in ("idle", "fault"))
+
+    def said_of_profile(self) -> list[str]:
+        """Return what the service said whenever it was asked to read its profile again."""
+        return [entry.text for entry in self.daemon.client.log(limit=_LOG_COUNT) if entry.event == "profile"]
 
     # ---- judging -------------------------------------------------------------------------------------------------
 

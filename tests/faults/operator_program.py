@@ -29,7 +29,8 @@ class Operator:
         """Start it, and wait until it is there: a lease is shorter than what a busy host needs for that."""
         command = [sys.executable, "-m", "tests.faults.operator_program", str(socket)]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=_ROOT)
-        assert self._process.stdin is not None and self._process.stdout is not None
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
         self._lines, self._said = self._process.stdin, self._process.stdout
         if not self._said.readline():
             raise RuntimeError(f"the operator's program ended with {self._process.wait()}")

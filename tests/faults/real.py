@@ -198,9 +198,15 @@ def _play(house: House, scenario: Scenario) -> Facts | str:
         facts.judged_until_t_ns = _seen_until_t_ns(house)
     time.sleep(0.3 if drawn_fault.lasts_s else 0.0)
     house.go_on_where_it_hung()
+    rig = house.rig_place
+    if drawn_fault.nonsense is not None:
+        house.take_power_away()
     facts.trouble = house.ready()
+    if drawn_fault.nonsense is not None:
+        facts.reread = house.said_of_profile()
     if not facts.trouble:
         house.find_rig()  # it may be another one
+        facts.opened_anew = house.rig_place != rig
         _seen_until_t_ns(house)
     until_t_ns = facts.judged_until_t_ns
     if np.isfinite(drawn_fault.detection_s):

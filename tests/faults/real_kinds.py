@@ -18,7 +18,8 @@ from stagectl.client import Client
 from stagectl.errors import StagectlError
 from stagectl.service.access import Role, read_tokens
 from tests.faults.house import House
-from tests.faults.kinds import CYCLE_S, NEVER_S, NONSENSE, Drawn, between, one_of
+from tests.faults.kinds import CYCLE_S, NEVER_S, Drawn, between, one_of
+from tests.faults.nonsense import nonsense
 from tests.service.daemon import servo_pid
 
 AT_ONCE_S = 3 * CYCLE_S
@@ -223,8 +224,11 @@ def disk_full(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
 
 
 def nonsense_profile(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
-    text = one_of(rng, NONSENSE)
-    return _harmless("profile edited to nonsense", lambda house: spoil_profile(house, text), lasts_s=1.2)
+    edited = nonsense(rng, "single-axis" if len(nodes) == 1 else "oled-printer")
+    text = f"profile edited to nonsense: {edited.what}"
+    return Real(
+        Drawn(text, act=lambda house: house.edit_profile(edited), must_stop=False, may_stop=False, nonsense=edited)
+    )
 
 
 def second_operator(house: House) -> None:
@@ -327,14 +331,6 @@ def full_disk(house: House, duration_s: float) -> None:
         while True:
             file.write(bytes(1 << 16))
     _later(duration_s, lambda: (house.daemon.runs.parent / "filler").unlink(missing_ok=True))
-
-
-def spoil_profile(house: House, text: str) -> None:
-    """Have a profile that is none read again, and the file as it was a second later."""
-    kept = house.daemon.profile.read_text()
-    house.daemon.profile.write_bytes(text.encode("latin-1"))
-    house.daemon.process.send_signal(signal.SIGHUP)
-    _later(1.0, lambda: house.daemon.profile.write_text(kept))
 
 
 KINDS: dict[str, Draw] = {
