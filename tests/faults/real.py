@@ -20,7 +20,7 @@ from tests.faults.judge import AT_WILL, BACK, BEGUN, COURSE, REST_M_PER_S, Recor
 from tests.faults.kinds import MACRO, MICRO, one_of
 from tests.faults.mechanics import mechanics_of
 from tests.faults.operator_program import JOG_HOLD_S
-from tests.faults.real_kinds import KINDS, Real
+from tests.faults.real_kinds import KINDS, Real, client_hangs
 from tests.faults.scene import TOP_M_PER_S, Facts
 from tests.small_disk import small_disk
 
@@ -38,6 +38,9 @@ _PHASES = {  # for how long a fault may wait in each, and how often one is drawn
     "idle": (0.5, 1),
 }
 _IN_TURN = {"client vanishes": ("jogging", "at rest", "jogging", "jogging", "moving")}  # mostly what it is there for
+_EVERY_OTHER = {"client vanishes": client_hangs}
+_FASTEST_M_PER_S = 0.25
+_GOES_ON_S = 1.5  # that long a jog has room that nobody holds any more: else the end of travel stops it, and hides all
 _TOUCHING_S = 2.0  # of a homing with a micro
 _REST_S, _OVER_S, _NEVER_RESTS_S = 0.2, 0.6, 10.0
 _SEEN_TO_REST_S, _LOOKS_AGAIN_S = 0.05, 0.5  # its power may go 0.1 s after it came to rest; then it rolls
@@ -101,9 +104,13 @@ def drawn(seed: int) -> Scenario:
         phase = _IN_TURN[kind][seed // len(KINDS) % len(_IN_TURN[kind])]
     longest_s = _PHASES[phase][0] + (_TOUCHING_S if phase == "homing" and MICRO in nodes else 0.0)
     wait_s = float(rng.uniform(0.0, longest_s))
-    speed_m_per_s = float(rng.uniform(0.05, 0.25))
-    target_m = float(rng.uniform(0.6, 0.9)) * mechanics_of(profile).travel_m[1]
-    return Scenario(kind, profile, phase, wait_s, speed_m_per_s, target_m, KINDS[kind](rng, nodes))
+    speed_m_per_s = float(rng.uniform(0.05, _FASTEST_M_PER_S))
+    end_m = mechanics_of(profile).travel_m[1]
+    if kind == "client vanishes":
+        speed_m_per_s *= min(1.0, end_m / (_GOES_ON_S * _FASTEST_M_PER_S))
+    target_m = float(rng.uniform(0.6, 0.9)) * end_m
+    draw = _EVERY_OTHER.get(kind, KINDS[kind]) if seed // len(KINDS) % 2 else KINDS[kind]
+    return Scenario(kind, profile, phase, wait_s, speed_m_per_s, target_m, draw(rng, nodes))
 
 
 def run(seed: int, folder: Path) -> RealResult:

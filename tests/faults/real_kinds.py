@@ -110,11 +110,14 @@ def killed_both(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
     return Real(Drawn("servo and supervisor killed", act=act, detection_s=RPDO_S, open_loop=True), by_drives=True)
 
 
-def client_vanishes(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
-    """A client's program ends while it holds the key, or says nothing more on a socket that stays open."""
-    half_open = bool(rng.random() < 0.5)
-    text = "client vanishes, its socket stays open" if half_open else "client vanishes"
-    return Real(Drawn(text, act=lambda house: house.vanish(half_open), detection_s=LEASE_S, silent=True))
+def client_killed(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    return Real(Drawn("client killed", act=lambda house: house.vanish(), detection_s=LEASE_S, silent=True))
+
+
+def client_hangs(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    """Its program is stopped: its socket stays open; when it goes on, its lease is over."""
+    text = "client stopped, its socket stays open"
+    return Real(Drawn(text, act=lambda house: house.vanish(half_open=True), detection_s=LEASE_S, silent=True))
 
 
 def _of_rig(text: str, faults: dict, **known) -> Real:
@@ -339,7 +342,7 @@ KINDS: dict[str, Draw] = {
     "both killed": killed_both,
     "servo stopped": stopped_child,
     "supervisor stopped": stopped_supervisor,
-    "client vanishes": client_vanishes,
+    "client vanishes": client_killed,
     "beam break": beam_break,
     "unplug and replug": unplugged,
     "bus-off and back": bus_off,
