@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from stagectl.toml_file import Flag, Problem, Table, above, missing, problem_if, refuse, whole, within
+from stagectl.toml_file import NO_BLANKS, Flag, Problem, Table, above, missing, problem_if, refuse, whole, within
 
 _TYPE_BYTES = {"u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "f32": 4, "f64": 8}
 _CHECKSUM_BYTES = {"none": 0, "sum8": 1, "xor8": 1, "crc16-ccitt": 2}
@@ -215,7 +215,7 @@ class MicroEpsilonFrame(Table):
 class InterferometerTable(Table):
     """What all formats share."""
 
-    port: Annotated[str, Field(pattern=r"^/\S+$")]
+    port: Annotated[str, Field(pattern=rf"^/{NO_BLANKS}$")]
     rate_hz: Annotated[float, within(10.0, 100e3)]
     noise_m: Annotated[float, above(0.0, 1e-5)]
     jitter_s: Annotated[float, within(0.0, 1e-4)] = 0.0  # rms of a sample's instant; at a speed it is noise as well

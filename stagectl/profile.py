@@ -14,7 +14,19 @@ from stagectl.effect_file import EffectFile
 from stagectl.effect_table import EffectTable, without_micro
 from stagectl.errors import ProfileError
 from stagectl.interferometer_profile import Interferometer, carries_end
-from stagectl.toml_file import Document, Flag, Problem, Table, above, missing, problem_if, refuse, whole, within
+from stagectl.toml_file import (
+    NO_BLANKS,
+    Document,
+    Flag,
+    Problem,
+    Table,
+    above,
+    missing,
+    problem_if,
+    refuse,
+    whole,
+    within,
+)
 
 PROFILES_FOLDER = Path(__file__).resolve().parent.parent / "profiles"
 SYSTEM_FOLDER = Path("/etc/stagectl")
@@ -25,7 +37,7 @@ TOUCH_FORCE_LIMIT_N = 5.0  # homing presses no harder
 _BUS_SHARE = 0.8  # of the bus, worst case: SDO, EMCY and heartbeats need room too
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
-EdsName = Annotated[str, Field(pattern=r"^\S+\.eds$")]
+EdsName = Annotated[str, Field(pattern=rf"^{NO_BLANKS}\.eds$")]
 Length = Annotated[float, within(-100.0, 100.0)]
 Mass = Annotated[float, above(0.0, 1e5)]
 Force = Annotated[float, above(0.0, 1e6)]
@@ -91,7 +103,7 @@ class Can(Table):
     """The bus; `channel` is an interface's name, or a socket's path for the hub."""
 
     interface: Literal["socketcan", "hub", "stagectl-hub", "virtual"]
-    channel: Annotated[str, Field(pattern=r"^\S+$")]
+    channel: Annotated[str, Field(pattern=rf"^{NO_BLANKS}$")]
     bitrate_bit_per_s: Annotated[float, within(10e3, 1e6)] = 1e6
 
 

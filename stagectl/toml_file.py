@@ -24,6 +24,9 @@ from stagectl.units import unit_of
 Flag = Annotated[bool, Strict()]
 """A boolean that is written as one: "yes" and 1 are refused."""
 
+NO_BLANKS = r"[^\s\x00-\x1f\x7f]+"
+"""Pattern of a name that is given to the system: one with a byte 0 in it is no error there, it raises."""
+
 # fmt: off
 _UNIT_WORDS = frozenset((
     "m", "mm", "um", "nm", "pm", "cm", "km", "inch", "in", "ft", "s", "ms", "us", "ns", "min", "h", "hz", "khz", "mhz",

@@ -506,6 +506,9 @@ CONTRADICTIONS = [
     ({"interferometer.incremental": 1}, "interferometer.incremental", "must be true or false"),
     ({"macro.eds": 3}, "macro.eds", "must be text"),
     ({"name": "Bench 1"}, "name", "must look like"),
+    ({"can.channel": "can\0"}, "can.channel", "must look like"),
+    ({"interferometer.port": "/dev/\0"}, "interferometer.port", "must look like"),
+    ({"interferometer.port": "/dev/\x1b[2J"}, "interferometer.port", "must look like"),
 ]
 
 

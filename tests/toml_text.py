@@ -1,6 +1,7 @@
 """TOML files for tests: a shipped file with some values changed, and where its numbers are."""
 
 import copy
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ def toml_of(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"').replace("\r", "\\r").replace("\n", "\\n") + '"'
+        return json.dumps(value, ensure_ascii=False)
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {toml_of(inner)}" for key, inner in value.items()) + " }"
     if isinstance(value, list):

@@ -5,7 +5,7 @@ It records as profiles do that say nothing of it: from arming to disarming.
 
 import contextlib
 import os
-import threading
+import signal
 import time
 from pathlib import Path
 
@@ -13,19 +13,20 @@ import numpy as np
 import pyarrow as pa
 
 from stagectl.backend import ask_rig
-from stagectl.client import Client
-from stagectl.errors import JogOver, LinkError, RequestError, StagectlError
+from stagectl.errors import RequestError, StagectlError
 from stagectl.service import messages
-from tests.faults.witness import seen_of
+from tests.faults.nonsense import Nonsense
+from tests.faults.operator_program import Operator
+from tests.faults.witness import joined, seen_of
 from tests.service.daemon import PATIENT, Daemon
 
 CHANGES = {**PATIENT, "macro.homing.speed_m_per_s": 0.1, "macro.homing.acceleration_m_per_s2": 0.5}
 LOOK_S = 0.02
 JOG_M_PER_S = 0.12
-JOG_HOLD_S = 0.5
 IDENTIFY_S = 4.0
 _PATIENCE_S = 120.0
 _UNDER_WAY_S = 10.0
+_LOG_COUNT = 1000
 _HOME_FROM_M = 0.08  # 0.8 s of search
 
 
@@ -39,14 +40,17 @@ class House:
         self.daemon = Daemon(folder, {**CHANGES, **(changes or {})}, runs, profile)
         self.seen: dict[str, np.ndarray] = {}
         self.accepted: list[str] = []
-        self._jogging = threading.Event()
-        self._over = threading.Event()
-        self._mute = threading.Event()
-        self._speed_m_per_s = 0.0
-        self._channel = ""
+        self.unasked: list[tuple[int, int]] = []
+        self._rests_t_ns = 0  # since when it rests and nothing was asked that gives power; 0: it was
+        self._operator: Operator | None = None
+        self._hung: Operator | None = None
+        self.rig_place = ""
 
     def close(self) -> None:
         """End everything."""
+        for one in (self._operator, self._hung):
+            if one is not None:
+                one.kill()
         self.daemon.end()
 
     # ---- the rig -------------------------------------------------------------------------------------------------
@@ -54,11 +58,11 @@ class House:
     def find_rig(self) -> None:
         """Remember where the rig is, so that it can be asked when its service is gone."""
         places = sorted((self.daemon.folder / "tmp").glob("stagectl-rig-*/can.socket"), key=os.path.getmtime)
-        self._channel = str(places[-1])
+        self.rig_place = str(places[-1])
 
     def state(self) -> dict:
         """Ask the rig what is true now."""
-        return ask_rig(self._channel, {"state": True})
+        return ask_rig(self.rig_place, {"state": True})
 
     @staticmethod
     def t_ns() -> int:
@@ -66,11 +70,11 @@ class House:
         return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
 
     def look_back(self) -> dict[str, np.ndarray]:
-        """Ask the rig for all that it saw, and keep it."""
+        """Ask the rig for all that it saw, and keep it, behind what an earlier one saw."""
         path = self.daemon.folder / "seen.npz"
-        ask_rig(self._channel, {"truth": str(path)})
+        ask_rig(self.rig_place, {"truth": str(path)})
         with np.load(path) as stored:
-            self.seen = seen_of({name: stored[name] for name in stored.files})
+            self.seen = joined(self.seen, seen_of({name: stored[name] for name in stored.files}))
         return self.seen
 
     @property
@@ -80,7 +84,7 @@ class House:
 
     def rig_fault(self, **fault) -> None:
         """Let something go wrong in the rig."""
-        ask_rig(self._channel, {"fault": fault})
+        ask_rig(self.rig_place, {"fault": fault})
 
     # ---- the operator --------------------------------------------------------------------------------------------
 
@@ -92,16 +96,20 @@ class House:
             try:
                 status = client.status()
                 last = f"{status.state} {status.waiting_for}"
+                self.note_rest(status.state)
                 if status.state == "armed" and client.lease_token:
                     return ""
                 if not client.lease_token or client.lease_state() is None:
+                    self._operator = self._operator or Operator(self.daemon.socket.absolute())
                     client.take_lease("anna", 2.0)
-                    self._keep_lease()
+                    self._operator.hold(client.lease_token)
                 if status.fault is not None:
                     client.acknowledge(status.fault.number)
                 elif status.state == "idle" and not status.homed:
+                    self._ask_for_power()
                     client.home()
                 elif status.state == "idle":
+                    self._ask_for_power()
                     client.arm()
             except StagectlError as error:
                 last = str(error)
@@ -110,36 +118,20 @@ class House:
             time.sleep(0.1)
         return f"not armed after {_PATIENCE_S:g} s: {last}"
 
-    def _keep_lease(self) -> None:
-        self._over.set()
-        self._over = threading.Event()
-        self._mute.clear()
-        threading.Thread(target=self._operate, args=(self._over,), daemon=True).start()
+    def note_rest(self, state: str) -> None:
+        """Note, where the service says that the stage has come to rest, that nobody has asked for power since."""
+        if state in ("idle", "fault") and not self._rests_t_ns:
+            self._rests_t_ns = self.t_ns()
 
-    def _operate(self, over: threading.Event) -> None:
-        """Renew the lease, and hold the key while jogging, as an operator's program does."""
-        jog = ""
-        with Client(self.daemon.socket) as client:
-            client.lease_token = self.daemon.client.lease_token
-            while not over.wait(0.1):
-                if self._mute.is_set():
-                    continue
-                try:
-                    client.renew_lease()
-                    if self._jogging.is_set():
-                        jog = jog or client.begin_jog(JOG_HOLD_S).key
-                        client.jog_at(jog, self._speed_m_per_s, JOG_HOLD_S)
-                except JogOver:
-                    jog = ""
-                except LinkError:
-                    continue
-                except StagectlError:
-                    return
+    def _ask_for_power(self) -> None:
+        if self._rests_t_ns:
+            self.unasked.append((self._rests_t_ns, self.t_ns()))
+            self._rests_t_ns = 0
 
     def set_off(self, speed_m_per_s: float = JOG_M_PER_S) -> bool:
         """Jog away from the nearer end until it truly moves; False where it does not get there."""
-        self._speed_m_per_s = -self._side() * speed_m_per_s
-        self._jogging.set()
+        assert self._operator is not None
+        self._operator.jog(-self._side() * speed_m_per_s)
         return self._until(lambda: self.speed_m_per_s > 0.95 * speed_m_per_s)
 
     def _side(self) -> float:
@@ -186,12 +178,39 @@ class House:
 
     def let_go(self) -> None:
         """Hold no key any more."""
-        self._jogging.clear()
+        if self._operator is not None:
+            self._operator.let_go()
 
     def vanish(self, half_open: bool = False) -> None:
-        """The operator's program is gone; `half_open`: as one that hangs, or behind a cut cable, its socket stays."""
-        (self._mute if half_open else self._over).set()
+        """The operator's program is gone; `half_open`: it hangs, and its socket stays, as behind a cut cable."""
+        gone, self._operator = self._operator, None
         self.daemon.client.lease_token = ""
+        if gone is not None and half_open:
+            gone.hang()
+            self._hung = gone
+        elif gone is not None:
+            gone.kill()
+
+    def go_on_where_it_hung(self) -> None:
+        """Let an operator's program that hung go on: its lease is over, so it is obeyed no more."""
+        hung, self._hung = self._hung, None
+        if hung is not None and hung.goes_on():
+            self.accepted.append("the lease of a client that had hung")
+
+    def edit_profile(self, edited: Nonsense) -> None:
+        """Spoil the profile, and ask for it to be read again."""
+        edited.put(self.daemon.profile)
+        self.daemon.process.send_signal(signal.SIGHUP)
+
+    def take_power_away(self) -> None:
+        """Stop an armed stage, and wait until it has no power: only then is a profile read again."""
+        client = self.daemon.client
+        client.stop()
+        self._until(lambda: client.status().state in ("idle", "fault"))
+
+    def said_of_profile(self) -> list[str]:
+        """Return what the service said whenever it was asked to read its profile again."""
+        return [entry.text for entry in self.daemon.client.log(limit=_LOG_COUNT) if entry.event == "profile"]
 
     # ---- judging -------------------------------------------------------------------------------------------------
 

@@ -64,7 +64,8 @@ TRAVEL, STANDSTILL = "travel beyond the bound", "followed a command after stands
 BEGUN, LOST, UNREADABLE = "stop begun late", "recorded cycles lost", "run unreadable"
 STRANGER, BACK, COURSE = "unauthorised command accepted", "not armed again", "went on, or stopped without need"
 STRUCK, LIMP = "macro without power too fast", "micro without power too far"
-BARS = (TRAVEL, STRUCK, LIMP, STANDSTILL, BEGUN, LOST, UNREADABLE, STRANGER, BACK, COURSE)
+NONSENSE = "nonsense taken for a profile, or refused unclearly"
+BARS = (TRAVEL, STRUCK, LIMP, STANDSTILL, BEGUN, LOST, UNREADABLE, STRANGER, BACK, COURSE, NONSENSE)
 """What a run can miss."""
 GENTLE = (
     "a: the greatest gain of speed until it was noticed, at most a plan's; behind an obstacle forward only; "
@@ -219,6 +220,10 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         found.append((LOST, f"{lost} cycles on the bus have no row"))
     found += [(UNREADABLE, text) for text in record.unreadable]
     found += [(STRANGER, name) for name in facts.accepted]
+    if drawn.nonsense is not None:
+        found += [(NONSENSE, text) for text in drawn.nonsense.missed(facts.reread)]
+        if facts.opened_anew:
+            found.append((NONSENSE, "the stage was opened anew"))
     if facts.trouble:
         found.append((BACK, facts.trouble))
     return Verdict(tuple(found), stopped, travel_m, bound_m, begun, lost, drift_m)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sim_backend.faults import Fault
+from tests.faults.nonsense import Nonsense, nonsense
 
 MACRO, MICRO = 1, 2  # node ids
 SYNC, MACRO_TPDO, MICRO_TPDO, MACRO_RPDO, MICRO_RPDO = 0x080, 0x181, 0x182, 0x201, 0x202
@@ -29,9 +30,6 @@ _LEASE_S = 2.0  # what a lease lasts that nobody renews
 JOG_HOLD_S = 0.3  # for how long a word of a jog's operator holds
 FRAME_S = 130e-6  # eight bytes at 1 Mbit/s
 NEVER_S = float("inf")
-
-NONSENSE = ("", "name = 3\n", 'name = "x"\n[macro]\nmass_kg = nan\n', "\x00\xff not a profile", "[macro\n")
-"""No profiles; characters of one byte."""
 
 MOVING = ("accelerating", "constant speed", "decelerating")
 PHASES = ("at rest", *MOVING, "jogging", "identifying", "homing", "stopping")
@@ -55,6 +53,7 @@ class Drawn:
     encoder_m: float = 0.0  # by which the drive's own encoder is off for a while: it holds on that
     pushed: bool = False  # by something that is no command: how far is not judged
     by_lasers: bool = False  # of what only a law goes by: while the drive homes by itself it must stop nothing
+    nonsense: Nonsense | None = None  # what the profile is edited to; it is read when the stage has no power
 
 
 Draw = Callable[[np.random.Generator, str], Drawn]
@@ -391,11 +390,13 @@ def second_operator(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def nonsense_profile(rng: np.random.Generator, phase: str) -> Drawn:
+    edited = nonsense(rng, "oled-printer")
     return Drawn(
-        "profile edited to nonsense, read again",
-        act=lambda scene: scene.edit_profile(rng),
+        f"profile edited to nonsense, read again: {edited.what}",
+        act=lambda scene: scene.edit_profile(edited),
         must_stop=False,
         may_stop=False,
+        nonsense=edited,
     )
 
 

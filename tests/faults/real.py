@@ -15,11 +15,12 @@ import pytest
 
 from stagectl.errors import LinkError, RecordError, StagectlError
 from stagectl.record import read_run
-from tests.faults.house import IDENTIFY_S, JOG_HOLD_S, LOOK_S, House
+from tests.faults.house import IDENTIFY_S, LOOK_S, House
 from tests.faults.judge import AT_WILL, BACK, BEGUN, COURSE, REST_M_PER_S, Record, judge
 from tests.faults.kinds import MACRO, MICRO, one_of
 from tests.faults.mechanics import mechanics_of
-from tests.faults.real_kinds import KINDS, Real
+from tests.faults.operator_program import JOG_HOLD_S
+from tests.faults.real_kinds import KINDS, Real, client_hangs
 from tests.faults.scene import TOP_M_PER_S, Facts
 from tests.small_disk import small_disk
 
@@ -37,6 +38,9 @@ _PHASES = {  # for how long a fault may wait in each, and how often one is drawn
     "idle": (0.5, 1),
 }
 _IN_TURN = {"client vanishes": ("jogging", "at rest", "jogging", "jogging", "moving")}  # mostly what it is there for
+_EVERY_OTHER = {"client vanishes": client_hangs}
+_FASTEST_M_PER_S = 0.25
+_GOES_ON_S = 1.5  # that long a jog has room that nobody holds any more: else the end of travel stops it, and hides all
 _TOUCHING_S = 2.0  # of a homing with a micro
 _REST_S, _OVER_S, _NEVER_RESTS_S = 0.2, 0.6, 10.0
 _SEEN_TO_REST_S, _LOOKS_AGAIN_S = 0.05, 0.5  # its power may go 0.1 s after it came to rest; then it rolls
@@ -100,9 +104,13 @@ def drawn(seed: int) -> Scenario:
         phase = _IN_TURN[kind][seed // len(KINDS) % len(_IN_TURN[kind])]
     longest_s = _PHASES[phase][0] + (_TOUCHING_S if phase == "homing" and MICRO in nodes else 0.0)
     wait_s = float(rng.uniform(0.0, longest_s))
-    speed_m_per_s = float(rng.uniform(0.05, 0.25))
-    target_m = float(rng.uniform(0.6, 0.9)) * mechanics_of(profile).travel_m[1]
-    return Scenario(kind, profile, phase, wait_s, speed_m_per_s, target_m, KINDS[kind](rng, nodes))
+    speed_m_per_s = float(rng.uniform(0.05, _FASTEST_M_PER_S))
+    end_m = mechanics_of(profile).travel_m[1]
+    if kind == "client vanishes":
+        speed_m_per_s *= min(1.0, end_m / (_GOES_ON_S * _FASTEST_M_PER_S))
+    target_m = float(rng.uniform(0.6, 0.9)) * end_m
+    draw = _EVERY_OTHER.get(kind, KINDS[kind]) if seed // len(KINDS) % 2 else KINDS[kind]
+    return Scenario(kind, profile, phase, wait_s, speed_m_per_s, target_m, draw(rng, nodes))
 
 
 def run(seed: int, folder: Path) -> RealResult:
@@ -196,13 +204,23 @@ def _play(house: House, scenario: Scenario) -> Facts | str:
     if not drawn_fault.must_stop:  # behind the question: to write it all holds the rig up, which may stop the stage
         facts.judged_until_t_ns = _seen_until_t_ns(house)
     time.sleep(0.3 if drawn_fault.lasts_s else 0.0)
+    house.go_on_where_it_hung()
+    rig = house.rig_place
+    if drawn_fault.nonsense is not None:
+        house.take_power_away()
     facts.trouble = house.ready()
+    if drawn_fault.nonsense is not None:
+        facts.reread = house.said_of_profile()
+    if not facts.trouble:
+        house.find_rig()  # it may be another one
+        facts.opened_anew = house.rig_place != rig
+        _seen_until_t_ns(house)
     until_t_ns = facts.judged_until_t_ns
     if np.isfinite(drawn_fault.detection_s):
         until_t_ns = facts.fault_t_ns + round(1e9 * (drawn_fault.detection_s + held_up_s))
     servo_late_s = house.lateness_s(facts.fault_t_ns, until_t_ns)
     facts.late_s = held_up_s + WAKE_S + (0.0 if scenario.fault.by_drives else servo_late_s)
-    facts.accepted = house.accepted
+    facts.accepted, facts.unasked = house.accepted, house.unasked
     facts.seen = house.seen
     if not drawn_fault.may_stop and facts.fault_kind and held_up_s + servo_late_s > HICCUP_S:
         raise HostHeldUp(f"{facts.fault_kind}, {(held_up_s + servo_late_s) * 1e3:.0f} ms late")
@@ -216,6 +234,7 @@ def _name_fault(house: House, scenario: Scenario, facts: Facts) -> None:
         daemon.start()
         daemon.client.lease_token = ""
         daemon.state_is("idle", "fault")
+        house.note_rest("idle")
         facts.fault_kind = "killed"
         return
     must = scenario.fault.drawn.must_stop and scenario.phase not in AT_WILL
@@ -223,6 +242,7 @@ def _name_fault(house: House, scenario: Scenario, facts: Facts) -> None:
     settled = ("fault",) if must else ("off", "idle", "armed", "fault")
     with contextlib.suppress(AssertionError):
         daemon.state_is(*settled)
+        house.note_rest(daemon.client.status().state)
     fault = daemon.client.fault()
     if fault is not None:
         facts.fault_kind, facts.fault_text = fault.kind, fault.values

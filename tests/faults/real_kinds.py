@@ -18,7 +18,8 @@ from stagectl.client import Client
 from stagectl.errors import StagectlError
 from stagectl.service.access import Role, read_tokens
 from tests.faults.house import House
-from tests.faults.kinds import CYCLE_S, NEVER_S, NONSENSE, Drawn, between, one_of
+from tests.faults.kinds import CYCLE_S, NEVER_S, Drawn, between, one_of
+from tests.faults.nonsense import nonsense
 from tests.service.daemon import servo_pid
 
 AT_ONCE_S = 3 * CYCLE_S
@@ -109,11 +110,14 @@ def killed_both(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
     return Real(Drawn("servo and supervisor killed", act=act, detection_s=RPDO_S, open_loop=True), by_drives=True)
 
 
-def client_vanishes(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
-    """A client's program ends while it holds the key, or says nothing more on a socket that stays open."""
-    half_open = bool(rng.random() < 0.5)
-    text = "client vanishes, its socket stays open" if half_open else "client vanishes"
-    return Real(Drawn(text, act=lambda house: house.vanish(half_open), detection_s=LEASE_S, silent=True))
+def client_killed(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    return Real(Drawn("client killed", act=lambda house: house.vanish(), detection_s=LEASE_S, silent=True))
+
+
+def client_hangs(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
+    """Its program is stopped: its socket stays open; when it goes on, its lease is over."""
+    text = "client stopped, its socket stays open"
+    return Real(Drawn(text, act=lambda house: house.vanish(half_open=True), detection_s=LEASE_S, silent=True))
 
 
 def _of_rig(text: str, faults: dict, **known) -> Real:
@@ -223,8 +227,11 @@ def disk_full(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
 
 
 def nonsense_profile(rng: np.random.Generator, nodes: Sequence[int]) -> Real:
-    text = one_of(rng, NONSENSE)
-    return _harmless("profile edited to nonsense", lambda house: spoil_profile(house, text), lasts_s=1.2)
+    edited = nonsense(rng, "single-axis" if len(nodes) == 1 else "oled-printer")
+    text = f"profile edited to nonsense: {edited.what}"
+    return Real(
+        Drawn(text, act=lambda house: house.edit_profile(edited), must_stop=False, may_stop=False, nonsense=edited)
+    )
 
 
 def second_operator(house: House) -> None:
@@ -329,21 +336,13 @@ def full_disk(house: House, duration_s: float) -> None:
     _later(duration_s, lambda: (house.daemon.runs.parent / "filler").unlink(missing_ok=True))
 
 
-def spoil_profile(house: House, text: str) -> None:
-    """Have a profile that is none read again, and the file as it was a second later."""
-    kept = house.daemon.profile.read_text()
-    house.daemon.profile.write_bytes(text.encode("latin-1"))
-    house.daemon.process.send_signal(signal.SIGHUP)
-    _later(1.0, lambda: house.daemon.profile.write_text(kept))
-
-
 KINDS: dict[str, Draw] = {
     "servo killed": killed_child,
     "supervisor killed": killed_supervisor,
     "both killed": killed_both,
     "servo stopped": stopped_child,
     "supervisor stopped": stopped_supervisor,
-    "client vanishes": client_vanishes,
+    "client vanishes": client_killed,
     "beam break": beam_break,
     "unplug and replug": unplugged,
     "bus-off and back": bus_off,

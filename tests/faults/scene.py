@@ -19,10 +19,11 @@ from stagectl.service.desk import Desk
 from stagectl.service.exposition import Figures
 from stagectl.service.notify import Notifier
 from stagectl.service.remembered import Remembered
-from stagectl.service.service_log import ServiceLog
+from stagectl.service.service_log import KEPT_COUNT, ServiceLog
 from stagectl.service.stage_loop import StageLoop
 from stagectl.service.stage_state import Settings
-from tests.faults.kinds import JOG_HOLD_S, NONSENSE, Drawn, one_of
+from tests.faults.kinds import JOG_HOLD_S, Drawn
+from tests.faults.nonsense import Nonsense
 from tests.faults.witness import WitnessedRig
 from tests.small_disk import small_disk
 from tests.struck_stage import home_by_truth
@@ -70,6 +71,8 @@ class Facts:
     said_t_ns: int = 0  # the last word of a jog's operator: its key is held no longer; 0 = never
     unasked: list[tuple[int, int]] = field(default_factory=list)  # behind the judged end: nobody asks for power
     accepted: list[str] = field(default_factory=list)  # of what nobody may ask
+    reread: list[str] = field(default_factory=list)  # what was said when a profile edited to nonsense was read
+    opened_anew: bool = False  # the stage, with that
     seen: dict[str, np.ndarray] = field(default_factory=dict)
     sync_t_ns: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
@@ -317,10 +320,20 @@ class Scene:
             ask()
             self.facts.accepted.append(name)
 
-    def edit_profile(self, rng: np.random.Generator) -> None:
+    def edit_profile(self, edited: Nonsense) -> None:
         """Spoil the file, and ask for it to be read again."""
-        self.profile_path.write_bytes(one_of(rng, NONSENSE).encode("latin-1"))
+        edited.put(self.profile_path)
         self.loop.reread()
+
+    def _have_it_read(self) -> None:
+        """Take the power away, without which nothing is read again, and keep what is said of the profile."""
+        stage = self.loop._stage
+        if self.status.state == "armed":
+            self.desk.ask_to_stop("the operator")
+        self.until(lambda: self.status.state == "idle" and not self.loop._rereading)
+        said = self._log.last(KEPT_COUNT)
+        self.facts.reread = [entry.text for entry in said if entry.event == "profile"]
+        self.facts.opened_anew = self.loop._stage is not stage
 
     # ---- the run -------------------------------------------------------------------------------------------------
 
@@ -343,6 +356,8 @@ class Scene:
         fault = self.status.fault
         if fault is not None:
             self.facts.fault_kind, self.facts.fault_text = fault.kind, fault.values
+        if self.drawn.nonsense is not None:
+            self._have_it_read()
         self._rests_t_ns = self.t_ns
         self.facts.trouble = self._way_back()
         self._ask_for_power()

@@ -13,6 +13,7 @@ from tests.faults.judge import (
     COURSE,
     LIMP,
     LOST,
+    NONSENSE,
     STANDSTILL,
     STRANGER,
     STRUCK,
@@ -23,6 +24,7 @@ from tests.faults.judge import (
 from tests.faults.kinds import KINDS, MACRO, MICRO, PHASES, SILENCE_S, Drawn
 from tests.faults.limp import shorted_way_m
 from tests.faults.mechanics import mechanics_of
+from tests.faults.nonsense import nonsense
 from tests.faults.scene import Facts
 from tests.faults.witness import ENABLED
 
@@ -306,6 +308,13 @@ def test_judges_see_what_should_not_have_happened():
     assert bars_missed(facts, record, replace(FAULT, may_stop=False)) == {COURSE}
     assert bars_missed(replace(facts, fault_kind=""), record) == {COURSE}
     assert bars_missed(replace(facts, accepted=["move"]), record) == {STRANGER}
+    edited = replace(FAULT, nonsense=nonsense(np.random.default_rng(0), "oled-printer"))
+    assert bars_missed(facts, record, edited) == {NONSENSE}  # nobody said that it was read
+    assert bars_missed(replace(facts, reread=["read again"]), record, edited) == {NONSENSE}
+    clear = replace(edited, nonsense=replace(edited.nonsense, named=()))
+    refused = replace(facts, reread=["kept as it was: /a/mine.toml: mass_kg is missing; add it"])
+    assert bars_missed(refused, record, clear) == set()
+    assert bars_missed(replace(refused, opened_anew=True), record, clear) == {NONSENSE}
     assert bars_missed(replace(facts, trouble="not homed"), record) == {BACK}
 
 

@@ -15,6 +15,13 @@ def seen_of(truth: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {**truth, "states": states.astype(np.int64)}
 
 
+def joined(before: dict[str, np.ndarray], now: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return what two rigs saw, one behind the other; of one that is asked again, what it saw at last."""
+    if not before or now["t_ns"][0] <= before["t_ns"][-1]:
+        return now
+    return {name: np.concatenate([before[name], now[name]]) for name in now}
+
+
 class WitnessedRig(Rig):
     """A rig that is asked what it saw, and goes on while no controller has the bus."""
 
