@@ -3,17 +3,19 @@
 import json
 import math
 
+import numpy as np
 import pytest
 
 from stagectl import trajectory
 from stagectl.errors import ProfileError, RequestError
 from stagectl.linear_loop import GAP, LEFT, ON_THE_WAY, RIGHT, believed_body, linearise
-from stagectl.margins import margins
+from stagectl.margins import grid_hz, margins
 from stagectl.profile import load_profile
 from stagectl.signals import Stop
 from stagectl.tuning.page import verdict
 from stagectl.tuning.patch import patched
 from stagectl.tuning.rules import MOVING, STIFFENING, Asked, assessed, tuned
+from stagectl.tuning.triangular import sensitivities
 from tests.command import call
 from tests.stage import followed, rms, true_error_m, with_values
 
@@ -71,6 +73,17 @@ def test_the_command_writes_a_profile_whose_loops_keep_the_margins(capsys, tmp_p
     code, _, err = call(capsys, "tune", new, "--page", tmp_path, "-o", new)
     assert code == 2
     assert "is the profile itself, which is never changed" in err
+
+
+@pytest.mark.parametrize("place", [GAP, RIGHT])
+def test_the_quick_way_to_the_worst_loop_sees_the_same_sensitivities(oled_profile, place):
+    """300 solutions against one triangular form: 1e-9 apart where the sensitivity matters; unbalanced, 30 %."""
+    frequency_hz = grid_hz(oled_profile.cycle.period_s)[::5]
+    for observer in ON_THE_WAY[::6]:
+        one = linearise(oled_profile, "dsmc", believed_body(oled_profile), place, 0.0, observer)
+        exact = 1.0 / np.abs(1.0 + one.loop_gain(frequency_hz))
+        assert np.max(exact) > 1.2
+        np.testing.assert_allclose(sensitivities(one, frequency_hz), exact, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["tuned", "tuned.tml", "tuned.toml.bak"])

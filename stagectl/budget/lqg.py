@@ -14,6 +14,7 @@ Inside, all is in periods, nanometres and the force that moves the mass by a nan
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,7 @@ class Loop:
     def __init__(self, around: Surroundings, design: Design):
         """Solve both Riccati equations; plant state (x, v, commands under way, newest first), filter (x, v, d)."""
         self.around, self.design = around, design
+        self._robustness: Robustness | None = None
         for name in ("mass_kg", "period_s", "sensor_noise_m"):
             if not getattr(around, name) > 0.0:
                 raise RequestError(f"{name} is {getattr(around, name):g}; a bound needs a number above 0")
@@ -259,6 +261,11 @@ class Loop:
 
     def robustness(self) -> Robustness:
         """Return loop gain, greatest sensitivity and delay margin; the filter is fed what the regulator asks."""
+        if self._robustness is None:  # a search asks for it, and what it then holds to for it again
+            self._robustness = self._seen_from_command()
+        return self._robustness
+
+    def _seen_from_command(self) -> Robustness:
         count, size = self._commands, 2 + self._commands
         behind = np.eye(3) - np.outer(self._gain, [1.0, 0.0, 0.0])
         asked = np.concatenate([-self._of_estimate @ behind, -self._law[2:]])
@@ -306,6 +313,7 @@ def bound(around: Surroundings) -> Hold:
     return Loop(around, Design(around.force_noise_n, around.force_drift_n_per_sqrt_s)).hold()
 
 
+@lru_cache(maxsize=64)  # a search is a thousand loops, and a budget, its page and its advice ask for the same
 def optimum(around: Surroundings, max_sensitivity: float = 2.0, step_peak_m_per_n: float = math.inf) -> Hold:
     """Return the best hold whose greatest sensitivity keeps to a limit: the bound where that does, else searched.
 
@@ -336,6 +344,7 @@ def optimum(around: Surroundings, max_sensitivity: float = 2.0, step_peak_m_per_
     return found.hold()
 
 
+@lru_cache(maxsize=64)
 def stiffest(around: Surroundings, max_sensitivity: float = 2.0) -> Loop:
     """Return the loop that a step of force moves least, its greatest sensitivity within a limit.
 

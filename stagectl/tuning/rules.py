@@ -32,6 +32,7 @@ from stagectl.linear_loop import GAP, LEFT, ON_THE_WAY, RIGHT, Body, Linearised,
 from stagectl.margins import Margins, grid_hz, margins
 from stagectl.tuning import mode as modes
 from stagectl.tuning.mode import Mode
+from stagectl.tuning.triangular import sensitivities
 
 if TYPE_CHECKING:
     from stagectl.profile import Profile
@@ -60,6 +61,7 @@ _BISECTIONS = 7
 _USUAL_SENSITIVITY = 2.0
 _SLACK = 1.002  # of a limit that a search ends at
 _COARSE = 5  # every fifth frequency tells which loop is the worst
+_ENOUGH_RATIO = 1.01  # of a limit: beyond it without a doubt, as a fine grid sees it too
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,12 +235,17 @@ def _stiffens(profile: "Profile", law: str) -> bool:
     return law == "dsmc" and profile.control.rest_drift_ratio < 1.0
 
 
-def _worst_on_the_way(profile: "Profile", law: str, body: Body, places: Iterable[int]) -> Linearised:
-    """Return the loop of the greatest sensitivity of those that a stiffening observer passes; an unstable one first."""
+def _worst_on_the_way(
+    profile: "Profile", law: str, body: Body, places: Iterable[int], enough_ratio: float = math.inf
+) -> Linearised:
+    """Return the loop of the greatest sensitivity of those that a stiffening observer passes; an unstable one first.
+
+    The first beyond `enough_ratio` will do: a search then knows that the gain is too high.
+    """
     frequency_hz = grid_hz(profile.cycle.period_s)[::_COARSE]
 
     def sensitivity(one: Linearised) -> float:
-        return float(np.max(1.0 / np.abs(1.0 + one.loop_gain(frequency_hz)))) if one.closed().is_stable() else math.inf
+        return float(np.max(sensitivities(one, frequency_hz))) if one.closed().is_stable() else math.inf
 
     gains = sorted({0.0, most_adaptive_gain_ratio(profile, law)})
     passed = (
@@ -247,7 +254,13 @@ def _worst_on_the_way(profile: "Profile", law: str, body: Body, places: Iterable
         for gain in gains
         for observer in ON_THE_WAY
     )
-    return max(passed, key=sensitivity)
+    worst = next(passed)
+    greatest = sensitivity(worst)
+    while not greatest > enough_ratio and (one := next(passed, None)) is not None:
+        found = sensitivity(one)
+        if found > greatest:
+            worst, greatest = one, found
+    return worst
 
 
 def _loops_with(one: Linearised, mode: Mode) -> list[Loop]:
@@ -340,7 +353,8 @@ def _searched(profile: "Profile", law: str, key: str, asked: Asked) -> float:
             return False
         if not _stiffens(profile, law):
             return True
-        one = margins(_worst_on_the_way(_with(profile, law, value), law, looked_at[-1][1], (GAP,)))
+        enough = _ENOUGH_RATIO * asked.max_sensitivity
+        one = margins(_worst_on_the_way(_with(profile, law, value), law, looked_at[-1][1], (GAP,), enough))
         return one.is_stable and _within(one, asked)
 
     values = np.geomspace(_SPAN[0], _SPAN[1], _GRID_COUNT) * now
