@@ -61,3 +61,17 @@ def test_a_delay_and_a_lag_that_leave_the_same_are_one_set(tmp_path):
     assert {(found.name, found.acts_on), *(alias[:2] for alias in found.aliases)} == late
     size = "delay_s" if found.name == "sensor_delay" else "time_constant_s"
     assert found.parameters[size] == pytest.approx(hidden["parameters"]["delay_s"], abs=3.0 * found.sds[size])
+
+
+def test_a_lag_is_told_from_a_delay_beside_all_names(tmp_path):
+    """A delay of the commands, named last, makes up for what a delay of the sensor lacks of its lag."""
+    case = generate.draw(2706, "multi", 8.0)
+    generate.write(case, tmp_path)
+    blind = load_set(tmp_path)
+    findings = find(blind.believed, list(blind.logs)[:3], [], nulls_count=20)
+    names = {(one.name, one.acts_on) for one in findings.named}
+    assert names == {
+        ("sensor_lag", "macro_sensor"),
+        ("command_delay", "macro_command"),
+        ("cable_spring", "macro_force"),
+    }
