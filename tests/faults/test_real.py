@@ -1,6 +1,7 @@
 """With real processes: an operator's program that hangs in a jog, and what of the way back is judged."""
 
 import numpy as np
+import pytest
 
 from tests.faults.house import House
 from tests.faults.mechanics import REST_M_PER_S
@@ -20,8 +21,9 @@ def jogs(house: House) -> None:
     raise AssertionError("it does not move")
 
 
-def test_a_client_that_is_gone_stops_the_stage_and_one_that_hung_is_obeyed_no_more(tmp_path):
-    house = House(tmp_path / "house")
+@pytest.mark.real_time
+def test_a_client_that_is_gone_stops_the_stage_and_one_that_hung_is_obeyed_no_more(tmp_path_factory):
+    house = House(tmp_path_factory.mktemp("house"))  # the path of a socket must be short
     try:
         house.daemon.state_is("idle")
         house.find_rig()
