@@ -12,13 +12,13 @@ from stagectl import toml_file
 from stagectl.effect_file import EffectFile
 from stagectl.effect_table import EffectTable, without_micro
 from stagectl.errors import ProfileError
-from stagectl.toml_file import Document, Problem, Table, above, missing, problem_if, refuse, whole, within
+from stagectl.toml_file import NO_BLANKS, Document, Problem, Table, above, missing, problem_if, refuse, whole, within
 
 MACHINES_FOLDER = Path(__file__).resolve().parent / "machines"
 EDS_FOLDER = Path(__file__).resolve().parent.parent / "profiles"
 
 AxisName = Literal["macro", "micro"]
-EdsName = Annotated[str, Field(pattern=r"^\S+\.eds$")]
+EdsName = Annotated[str, Field(pattern=rf"^{NO_BLANKS}\.eds$")]
 Length = Annotated[float, within(-100.0, 100.0)]
 Stiffness = Annotated[float, above(0.0, 1e10)]
 Damping = Annotated[float, within(0.0, 1e7)]

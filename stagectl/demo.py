@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from stagectl import trajectory as trajectories
+from stagectl.errors import DriveError, TimingError
 from stagectl.outcome import Outcome
 from stagectl.profile import Profile
 from stagectl.signals import Stop
@@ -65,11 +66,14 @@ class Host:
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """What the stage did: every motion's last outcome in order, and what had to be repeated."""
+    """What the stage did: every motion's last outcome in order, and what had to be repeated.
+
+    Given up, it may have none.
+    """
 
     outcomes: tuple[Outcome, ...]
     trips: tuple[Trip, ...]
-    host: "Host"
+    host: Host
 
     @property
     def stop(self) -> Stop:
@@ -148,7 +152,20 @@ class _Flow:
         self.trips: list[Trip] = []
 
     def does(self, name: str, motion: Callable[[], Outcome]) -> bool:
-        """Move, once more where the guard ended it; tells whether the motion came to its own end."""
+        """Move, once more where the guard ended it; tells whether the motion came to its own end.
+
+        What a late host makes of a motion, an edge that is not met in any sweep say, is no error of the drives.
+        """
+        try:
+            outcome = self._outcome(name, motion)
+        except (DriveError, TimingError):
+            if not self.host().is_late:
+                raise
+            return False
+        self.outcomes.append(outcome)
+        return outcome.finished and not self.host().is_late
+
+    def _outcome(self, name: str, motion: Callable[[], Outcome]) -> Outcome:
         outcome = motion()
         if not outcome.finished and not self.host().is_late:
             trip = Trip(name, outcome)
@@ -157,8 +174,7 @@ class _Flow:
             self._stage.acknowledge()
             if outcome.stop is not Stop.REFERENCE_LOST or name == "home" or self._stage.home().finished:
                 outcome = motion()
-        self.outcomes.append(outcome)
-        return outcome.finished and not self.host().is_late
+        return outcome
 
     def host(self) -> Host:
         """Return what the host missed until now."""

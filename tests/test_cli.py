@@ -404,6 +404,24 @@ def test_nothing_interrupts_the_way_to_rest(capsys):
     assert json.loads(capsys.readouterr().out)["stopped"]
 
 
+@pytest.mark.parametrize("while_hushed", [True, False])
+def test_an_interrupt_is_heard_again_where_more_follows(capsys, while_hushed):
+    def work(voice):
+        voice.hush()
+        if while_hushed:
+            os.kill(os.getpid(), signal.SIGINT)
+        voice.progress("stopping", 0.0)
+        voice.listen()
+        if not while_hushed:
+            os.kill(os.getpid(), signal.SIGINT)
+        voice.progress("the next one", 0.0)
+        return Answer({})
+
+    with pytest.raises(cli.typer.Exit) as end:
+        deliver("test", True, work)
+    assert end.value.exit_code == 130
+
+
 def test_runs_that_can_not_be_are_refused_before_anything_opens(capsys, tmp_path):
     (tmp_path / "file").write_text("")
     for runs in (tmp_path / "file", tmp_path / "file" / "below"):

@@ -14,6 +14,7 @@ from sim_backend.faults import Fault
 from sim_backend.machine import load_machine
 from stagectl import demo
 from stagectl.backend import BatchBackend
+from stagectl.errors import DriveError
 from stagectl.profile import load_profile
 from stagectl.record import read_manifest, read_run
 from stagectl.run_page import page, scores_of
@@ -22,6 +23,7 @@ from stagectl.signals import Stop
 from stagectl.supervisor import Supervisor
 from stagectl.trajectory import trapezoid
 from tests.command import call, call_json
+from tests.stage import with_values
 
 
 @pytest.fixture(scope="module")
@@ -251,6 +253,23 @@ def test_a_host_that_misses_more_than_is_borne_ends_the_demo(tmp_path):
     borne = driven_on_a_late_host(tmp_path / "borne")
     assert not borne.given_up
     assert borne.host.missed_ratio > 1e-3
+
+
+@pytest.mark.parametrize("held_up_s", [0.0, 0.015])
+def test_what_a_late_host_makes_of_a_motion_is_no_error_of_the_drives(tmp_path, held_up_s):
+    """A homing that ends with an error, and not with a stop: the joint's edges are out of reach."""
+    machine = with_values(load_machine("oled-printer"), backlash__left_m=0.7e-3, backlash__right_m=0.7e-3)
+    backend = BatchBackend(machine, seed=1)
+    with Supervisor(load_profile("oled-printer"), backend, tmp_path / "run") as stage:
+        backend.wire.advance_to(backend.wire.t_ns + round(1e9 * held_up_s))
+        plan = trapezoid(0.05, 0.1, dwell_s=0.3, start_m=0.0, lead_s=0.3)
+        if held_up_s:
+            driven = demo.drive(stage, plan, bears_missed_ratio=1e-4)
+            assert driven.given_up
+            assert driven.outcomes == ()
+        else:
+            with pytest.raises(DriveError, match="not both edges of the joint were touched"):
+                demo.drive(stage, plan, bears_missed_ratio=1e-4)
 
 
 @pytest.mark.real_time

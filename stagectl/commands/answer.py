@@ -44,6 +44,7 @@ class Voice:
     console: Console
     progress: LiveProgress
     hush: Callable[[], None]  # from here on no signal interrupts
+    listen: Callable[[], None]  # from here on one does again
     run_folder: Path | None = field(default=None)
     whole_file: Path | None = field(default=None)  # a result that is there whatever comes after
     left_behind: str = "nothing was recorded"  # by an interrupt, where this command has no run of its own
@@ -83,7 +84,7 @@ def deliver(command: str, as_json: bool, work: Callable[[Voice], Answer], compil
     """
     console = Console(stderr=True)
     interruption = Interruption()
-    voice = Voice(console, LiveProgress(console, interruption.check), interruption.hush)
+    voice = Voice(console, LiveProgress(console, interruption.check), interruption.hush, interruption.listen)
     if compiles:
         _say_where_compiled_code_goes(voice)
     try:

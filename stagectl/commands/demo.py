@@ -40,6 +40,7 @@ def show(voice: Voice, profile: str, backend: str | None, runs_root: Path, seed:
     if driven.given_up:
         remark = _given_up_text(driven.host, folder)
         voice.warn(remark)
+        voice.listen()
         driven, folder = _driven(voice, replace(where, backend="batch"), trajectory)
     voice.progress("scoring and drawing", 0.0)
     run = read_run(folder)

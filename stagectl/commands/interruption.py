@@ -19,7 +19,7 @@ class Interruption:
     """A context in which the first signal becomes a KeyboardInterrupt from `check`, and later ones are ignored.
 
     Where nobody calls `check` for a second (a drive that answers slowly), the interrupt is raised right there.
-    After `hush` nothing interrupts any more: coming to rest and closing the run go on undisturbed.
+    After `hush` nothing interrupts until `listen`: coming to rest and closing the run go on undisturbed.
     A terminal that is gone (SIGHUP) takes no word: what would be said there goes nowhere, instead of failing.
     """
 
@@ -55,6 +55,10 @@ class Interruption:
         """Raise nothing from here on."""
         self._raised = True
         signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+    def listen(self) -> None:
+        """Hear signals again, one that came meanwhile too: what had to go on undisturbed is done, and more follows."""
+        self._raised = False
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGHUP:

@@ -92,7 +92,7 @@ def looked_closely(
         elif _keys(look) > compared and (anew := _again_in(first, plain, look, unsettled, crew)) is not None:
             compared = _keys(look)
             if _keys(anew) == compared:
-                look = _with_aliases_of(look, anew)
+                look = _with_forms_of(look, anew)
                 break
             look = known = plain = anew
             moved = ()
@@ -173,14 +173,11 @@ def _again_in(first: Competition, plain: Look, look: Look, unsettled: Sequence[R
     return _of_best_form(Look(first, chosen, all_named(first, chosen)), unsettled, crew)
 
 
-def _with_aliases_of(look: Look, other: Look) -> Look:
-    """Return a look whose names that moved readings have the aliases that they have in another."""
-    aliases = {(one.name, one.acts_on): one.aliases for one in other.named}
-    moved = {(effect.name, place) for effect, place, _ in look.search.moved}
-    named = tuple(
-        replace(one, aliases=aliases[one.name, one.acts_on]) if (one.name, one.acts_on) in moved else one
-        for one in look.named
-    )
+def _with_forms_of(look: Look, other: Look) -> Look:
+    """Return a look in which what moves readings has the aliases that it has in another look of the same names."""
+    moving = {group.key for group in other.chosen if moves_readings(other.search, group)}
+    aliases = {key: one.aliases for one in other.named if (key := (one.name, one.acts_on)) in moving}
+    named = tuple(replace(one, aliases=aliases.get((one.name, one.acts_on), one.aliases)) for one in look.named)
     return look._replace(named=named)
 
 

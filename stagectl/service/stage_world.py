@@ -24,8 +24,8 @@ _CONNECT_S = 240.0  # a cold compile cache on a slow host
 _CLOSE_S = 60.0  # coming to rest, rows to the disk
 _OPENING = "opening the stage"
 _STOPS = (Phase.STOPPING, Phase.GUIDED_STOP, Phase.QUICK_STOP)
-_AS_ASKED = (Stop.NONE, Stop.OPERATOR, Stop.FINISHED, Stop.HOMING_GIVEN_UP)
-"""A search that found no index on this side goes on on the other."""
+_NO_FAULTS = (Stop.NONE, Stop.OPERATOR, Stop.FINISHED, Stop.HOMING_GIVEN_UP)
+"""With these a stage was asked to stop, or looks for its index on the other side: it does not stop by itself."""
 ENDING = "the service was asked to end"
 """Why the stage comes to rest at the service's end."""
 
@@ -202,6 +202,6 @@ class StageWorld(StageState):
             self._stage.ask_to_stop()
         elif self._stage is not None and not self._opening and self._state in (State.MOVING, State.IDENTIFYING):
             status = self._stage.status()
-            if status["phase"] in _STOPS and status["stop"] not in _AS_ASKED:
+            if status["phase"] in _STOPS and status["stop"] not in _NO_FAULTS:
                 self._stop_by_itself()
         self._tick()
