@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from stagectl import trajectory as trajectories
-from stagectl.errors import DriveError, TimingError
+from stagectl.errors import DriveError, LinkError, TimingError
 from stagectl.outcome import Outcome
 from stagectl.profile import Profile
 from stagectl.signals import Stop
@@ -154,11 +154,11 @@ class _Flow:
     def does(self, name: str, motion: Callable[[], Outcome]) -> bool:
         """Move, once more where the guard ended it; tells whether the motion came to its own end.
 
-        What a late host makes of a motion, an edge that is not met in any sweep say, is no error of the drives.
+        What a late host makes of a motion, an edge that is not met in any sweep say, is no error of drives or wires.
         """
         try:
             outcome = self._outcome(name, motion)
-        except (DriveError, TimingError):
+        except (DriveError, LinkError, TimingError):
             if not self.host().is_late:
                 raise
             return False

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sim_backend.faults import Fault
+from tests.faults.draws import between, one_of
 from tests.faults.nonsense import Nonsense, nonsense
 
 MACRO, MICRO = 1, 2  # node ids
@@ -62,16 +63,6 @@ Draw = Callable[[np.random.Generator, str], Drawn]
 def grave(rng: np.random.Generator) -> bool:
     """Draw whether a fault is one that must stop the stage, as often as one that may go by."""
     return bool(rng.random() < 0.5)
-
-
-def one_of(rng: np.random.Generator, values):
-    """Draw one of the values."""
-    return values[int(rng.integers(len(values)))]
-
-
-def between(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw evenly in the logarithm."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 def _lost(rng: np.random.Generator, ids: tuple[int, ...], low_s: float, detection_s: float, what: str) -> Drawn:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from stagectl.profile import PROFILES_FOLDER
+from tests.faults.draws import one_of
 
 # fmt: off
 _OPTIONAL = frozenset((
@@ -94,10 +95,6 @@ def _is_number(one: _Entry) -> bool:
     return one.value[0] not in '"[' and one.value not in ("true", "false")
 
 
-def _one(rng: np.random.Generator, values):
-    return values[int(rng.integers(len(values)))]
-
-
 def _with_value(text: str, one: _Entry, value: str, *named: str) -> Nonsense:
     content = text[: one.value_begin] + value + text[one.end :]
     return Nonsense(f"{one.place} = {value}", (one.table, one.key, *named), content.encode())
@@ -105,27 +102,27 @@ def _with_value(text: str, one: _Entry, value: str, *named: str) -> Nonsense:
 
 def wrong_number(rng: np.random.Generator, text: str) -> Nonsense:
     """Write what is no number, or one that nothing has."""
-    one = _one(rng, [one for one in _entries(text) if _is_number(one)])
+    one = one_of(rng, [one for one in _entries(text) if _is_number(one)])
     writings = [("nan", "= nan"), ("-inf", "= -inf"), ("1e30", "= 1e+30"), ('"12"', '= "12"'), ("true", "= true")]
     writings += [("[1.0]", "= [1.0]"), ("1979-05-27", "= 1979-05-27"), ("1" + "0" * 400, "bits")]
     if one.key not in _SIGNED and one.value[0] != "-":
         writings.append(("-1", "= -1"))
-    value, named = _one(rng, writings)
+    value, named = one_of(rng, writings)
     return _with_value(text, one, value, named)
 
 
 def wrong_text(rng: np.random.Generator, text: str) -> Nonsense:
     """Write a number for a word, or a word that nothing is called."""
-    one = _one(rng, [one for one in _entries(text) if one.value[0] == '"'])
-    value = _one(rng, ("3", "nan", '"no such thing"', '""', "[]", r'"\u001b[31m\u0000"'))
+    one = one_of(rng, [one for one in _entries(text) if one.value[0] == '"'])
+    value = one_of(rng, ("3", "nan", '"no such thing"', '""', "[]", r'"\u001b[31m\u0000"'))
     return _with_value(text, one, value, "= ")
 
 
 def wrong_list(rng: np.random.Generator, text: str) -> Nonsense:
     """Give the ends of a range in disorder, or no range."""
-    one = _one(rng, [one for one in _entries(text) if one.value[0] == "["])
+    one = one_of(rng, [one for one in _entries(text) if one.value[0] == "["])
     low, high = one.value.strip("[]").split(", ")
-    value = _one(
+    value = one_of(
         rng, (f"[{high}, {low}]", f"[{low}]", f"[nan, {high}]", f"[{low}, {high}, 1.0]", "{}", f"[{low}, {low}]")
     )
     return _with_value(text, one, value)
@@ -133,14 +130,14 @@ def wrong_list(rng: np.random.Generator, text: str) -> Nonsense:
 
 def other_unit(rng: np.random.Generator, text: str) -> Nonsense:
     """Rename a key to another unit."""
-    one = _one(rng, [one for one in _entries(text) if one.key.rpartition("_")[2] in _OTHER_UNIT and "_" in one.key])
+    one = one_of(rng, [one for one in _entries(text) if one.key.rpartition("_")[2] in _OTHER_UNIT and "_" in one.key])
     stem, _, unit = one.key.rpartition("_")
     return _renamed(text, one, f"{stem}_{_OTHER_UNIT[unit]}")
 
 
 def misspelt(rng: np.random.Generator, text: str) -> Nonsense:
     """Leave a letter of a key out, or write it twice."""
-    one = _one(rng, [one for one in _entries(text) if len(one.key) > 3])
+    one = one_of(rng, [one for one in _entries(text) if len(one.key) > 3])
     at = int(rng.integers(1, len(one.key) - 1))
     key = one.key[:at] + one.key[at + 1 :] if rng.random() < 0.5 else one.key[:at] + one.key[at] + one.key[at:]
     return _renamed(text, one, key)
@@ -154,7 +151,7 @@ def _renamed(text: str, one: _Entry, key: str) -> Nonsense:
 
 def no_key(rng: np.random.Generator, text: str) -> Nonsense:
     """Take a line's key out."""
-    one = _one(rng, [one for one in _entries(text) if one.is_line and one.key not in _OPTIONAL])
+    one = one_of(rng, [one for one in _entries(text) if one.is_line and one.key not in _OPTIONAL])
     line_end = text.index("\n", one.end) + 1
     return Nonsense(
         f"no {one.place}", (one.table, one.key, "is missing"), (text[: one.begin] + text[line_end:]).encode()
@@ -163,7 +160,7 @@ def no_key(rng: np.random.Generator, text: str) -> Nonsense:
 
 def doubled_key(rng: np.random.Generator, text: str) -> Nonsense:
     """Write a line's key twice."""
-    one = _one(rng, [one for one in _entries(text) if one.is_line])
+    one = one_of(rng, [one for one in _entries(text) if one.is_line])
     again = f"{one.key} = {one.value}\n"
     content = text[: one.begin] + again + text[one.begin :]
     line = text.count("\n", 0, one.begin) + 2
@@ -173,7 +170,7 @@ def doubled_key(rng: np.random.Generator, text: str) -> Nonsense:
 def no_table(rng: np.random.Generator, text: str) -> Nonsense:
     """Take a table out, or call it otherwise."""
     headers = [one for one in _HEADER.finditer(text) if one["table"] != "effects"]
-    one = _one(rng, headers)
+    one = one_of(rng, headers)
     following = [other.start() for other in _HEADER.finditer(text) if other.start() > one.start()]
     if rng.random() < 0.5:
         content = text[: one.start()] + text[following[0] :]
@@ -187,7 +184,7 @@ def no_text(rng: np.random.Generator, text: str) -> Nonsense:
     """Put bytes in it that are no UTF-8, or no TOML."""
     content = text.encode()
     at = int(rng.integers(len(content)))
-    odd, named = _one(rng, ((b"\xff", "is not UTF-8"), (b"\xed\xa0\x80", "is not UTF-8"), (b"\x00", "is not TOML")))
+    odd, named = one_of(rng, ((b"\xff", "is not UTF-8"), (b"\xed\xa0\x80", "is not UTF-8"), (b"\x00", "is not TOML")))
     return Nonsense(f"bytes {odd.hex()} at {at}", (named,), content[:at] + odd + content[at:])
 
 
@@ -200,7 +197,7 @@ def cut(rng: np.random.Generator, text: str) -> Nonsense:
 
 def no_file(rng: np.random.Generator, text: str) -> Nonsense:
     """Leave nothing, a folder, or what is no profile at all."""
-    return _one(
+    return one_of(
         rng,
         (
             Nonsense("empty", ("is missing",), b""),
@@ -232,4 +229,4 @@ DRAWS: tuple[Callable[[np.random.Generator, str], Nonsense], ...] = (
 
 def nonsense(rng: np.random.Generator, profile: str) -> Nonsense:
     """Draw what a shipped profile is edited to."""
-    return _one(rng, DRAWS)(rng, (PROFILES_FOLDER / f"{profile}.toml").read_text())
+    return one_of(rng, DRAWS)(rng, (PROFILES_FOLDER / f"{profile}.toml").read_text())

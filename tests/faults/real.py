@@ -15,9 +15,10 @@ import pytest
 
 from stagectl.errors import LinkError, RecordError, StagectlError
 from stagectl.record import read_run
+from tests.faults.draws import one_of
 from tests.faults.house import IDENTIFY_S, LOOK_S, House
 from tests.faults.judge import AT_WILL, BACK, BEGUN, COURSE, REST_M_PER_S, Record, judge
-from tests.faults.kinds import MACRO, MICRO, one_of
+from tests.faults.kinds import MACRO, MICRO
 from tests.faults.mechanics import mechanics_of
 from tests.faults.operator_program import JOG_HOLD_S
 from tests.faults.real_kinds import KINDS, Real, client_hangs

@@ -17,8 +17,9 @@ import numpy as np
 from stagectl.client import Client
 from stagectl.errors import StagectlError
 from stagectl.service.access import Role, read_tokens
+from tests.faults.draws import between, one_of
 from tests.faults.house import House
-from tests.faults.kinds import CYCLE_S, NEVER_S, Drawn, between, one_of
+from tests.faults.kinds import CYCLE_S, NEVER_S, Drawn
 from tests.faults.nonsense import nonsense
 from tests.service.daemon import servo_pid
 
