@@ -116,7 +116,7 @@ put() { # FROM TO: only where it differs, so that a second time changes nothing
 switch_to() { # RELEASE
   local program=$DESTDIR$PROGRAM
   if [[ $(readlink "$program/current" 2>/dev/null) != "$1" ]]; then
-    ln -s "$1" "$program/.current"
+    ln -sfn "$1" "$program/.current" # one that an interrupted install left is replaced, and not entered
     mv -T "$program/.current" "$program/current"
     rm -rf "$DESTDIR"/var/cache/stagectl/* # compiled from other sources
   fi

@@ -81,9 +81,18 @@ class Homing(StreamMotion):
         give_up_t_ns = self.link.now_t_ns() + round(_STANDSTILL_TIMEOUT_S * 1e9)
         status = self._await_sensor()
         while status["phase"] != Phase.STOPPED:
-            self.pump(_STANDSTILL_WINDOW_S)
+            window_over_t_ns = self.link.now_t_ns() + round(_STANDSTILL_WINDOW_S * 1e9)
+            # In steps: a lease may be shorter than the window, and a stop is heard in it.
+            self._wait(
+                lambda _, over_t_ns=window_over_t_ns: self._asked_to_stop or self.link.now_t_ns() >= over_t_ns,
+                _STANDSTILL_TIMEOUT_S,
+                "waiting for standstill",
+            )
             status = self._await_sensor()
             if status["phase"] != Phase.HOMED_DRIVE:  # something stops it: why is known when it is over
+                continue
+            if self._asked_to_stop:  # the macro stands, and has power
+                self._request(mode=int(Mode.STOP), stop=int(Stop.NONE))
                 continue
             rows = self.link.rows.read_last(window_rows)
             # From the least to the greatest: where a swing turns round, it is as far after a while as before.

@@ -272,6 +272,24 @@ def test_what_a_late_host_makes_of_a_motion_is_no_error_of_the_drives(tmp_path, 
                 demo.drive(stage, plan, bears_missed_ratio=1e-4)
 
 
+def test_what_a_late_host_makes_of_a_homing_is_no_error_of_the_wires(tmp_path, single_profile, single_machine):
+    """A drive that was not heard of as it let go of the stage: the bus may be whole, and the host away."""
+    backend = BatchBackend(single_machine, seed=1)
+    struck = False
+
+    def strike(rows):
+        nonlocal struck
+        if not struck and rows["homing_id"].any():
+            struck = True
+            backend.rig.inject(Fault("power_loss", node_id=1, duration_s=1e3), backend.wire.t_ns)
+
+    with Supervisor(single_profile, backend, tmp_path / "run", observe=strike) as stage:
+        backend.wire.advance_to(backend.wire.t_ns + 15_000_000)
+        driven = demo.drive(stage, trapezoid(0.05, 0.1, dwell_s=0.3, start_m=0.0), ("pid",), bears_missed_ratio=1e-4)
+    assert driven.given_up
+    assert driven.outcomes == ()
+
+
 @pytest.mark.real_time
 def test_the_demo_comes_to_its_end_on_any_host(tmp_path):
     """In real time where this host can, else in virtual time; never silently."""

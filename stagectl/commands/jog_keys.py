@@ -51,7 +51,11 @@ class Hand:
                 self.speed_m_per_s = min(self.speed_m_per_s * (2.0 if key in _FASTER else 0.5), self._top_m_per_s)
             else:
                 self.leaves = self.leaves or key in _LEAVE
-                self._direction, self._until_s = 0.0, -math.inf
+                self.let_go()
+
+    def let_go(self) -> None:
+        """Hold no key."""
+        self._direction, self._until_s = 0.0, -math.inf
 
     def wanted_m_per_s(self, now_s: float) -> float:
         """Return the velocity that the keys want now."""
@@ -87,12 +91,22 @@ def _follow_keys(voice: Voice, stage: Client, hand: Hand, fileno: int) -> None:
             if not keys:
                 return
             hand.press(keys, time.monotonic())
-        wanted = hand.wanted_m_per_s(time.monotonic())
+        asked_s = time.monotonic()
+        wanted = hand.wanted_m_per_s(asked_s)
         if wanted != 0.0 and not key:
             key = stage.begin_jog().key  # which may take its time: what the keys want is looked at again
         elif wanted != 0.0 or was_moving:
             key = _gone_on(stage, key, wanted)
         was_moving = wanted != 0.0
+        if time.monotonic() - asked_s > NEXT_HOLD_S:
+            let_go_meanwhile(hand, fileno)
+
+
+def let_go_meanwhile(hand: Hand, fileno: int) -> None:
+    """Take what was typed while a request was under way, and hold none of it: it may have been let go of long since."""
+    while select.select([fileno], [], [], 0.0)[0] and (keys := os.read(fileno, 256)):
+        hand.press(keys, time.monotonic())
+    hand.let_go()
 
 
 def _gone_on(stage: Client, key: str, wanted_m_per_s: float) -> str:

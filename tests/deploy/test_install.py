@@ -142,6 +142,20 @@ def test_a_release_that_was_left_unfinished_is_made_anew(host):
     assert content.keys() == whole.keys()
 
 
+def test_an_install_that_was_interrupted_at_its_switch_leaves_the_next_one_right(host, later_repository):
+    """The link that was to be moved was still there, and the next one was made inside the release that it led to."""
+    host.does("install")
+    releases = host.root / "opt/stagectl"
+    before = os.readlink(releases / "current")
+    (releases / ".current").symlink_to(before)
+    later = Host.__new__(Host)
+    later.root, later.repository = host.root, later_repository
+    later.does("upgrade")
+    assert os.readlink(releases / "current") != before
+    assert {path.name for path in releases.iterdir()} == {"current", os.readlink(releases / "current")}
+    assert (releases / "current/stagectl/added.py").exists()
+
+
 def test_an_uninstall_leaves_nothing(host):
     before = host.content()
     host.does("install")

@@ -4,14 +4,16 @@ import io
 import json
 import os
 import pty
+import select
 import subprocess
 import sys
 import time
+import tty
 
 import pytest
 
 from stagectl import cli
-from stagectl.commands.jog_keys import FIRST_HOLD_S, NEXT_HOLD_S, Hand
+from stagectl.commands.jog_keys import FIRST_HOLD_S, NEXT_HOLD_S, Hand, let_go_meanwhile
 
 pytestmark = pytest.mark.real_time
 
@@ -209,6 +211,25 @@ def test_keys_jog_while_they_are_held(idle):
     finally:
         end(leader, jogging)
     assert -0.06 < moved_m < -0.01
+
+
+def test_what_was_typed_while_a_request_was_under_way_is_held_no_more():
+    """Taken for keys held now, repeats of a key let go of 0.5 s before set the stage off for another 0.6 s."""
+    hand = Hand(0.01, 0.03)
+    leader, follower = pty.openpty()
+    try:
+        tty.setcbreak(follower)
+        os.write(leader, RIGHT * 30 + UP + RIGHT)
+        let_go_meanwhile(hand, follower)
+        assert not select.select([follower], [], [], 0.0)[0]
+        assert hand.wanted_m_per_s(time.monotonic()) == 0.0
+        assert (hand.speed_m_per_s, hand.leaves) == (0.02, False)
+        os.write(leader, RIGHT + b"q")
+        let_go_meanwhile(hand, follower)
+        assert hand.leaves
+    finally:
+        os.close(leader)
+        os.close(follower)
 
 
 def test_a_hand_holds_goes_on_turns_and_lets_go():
