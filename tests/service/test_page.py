@@ -71,6 +71,31 @@ def test_a_stranger_sees_nothing(page, place):
         assert "works once" in answer.json()["message"]
 
 
+def test_no_cookie_of_another_server_here_keeps_a_stop_out(page, idle):
+    """A browser sends what any port of 127.0.0.1 gave it, in any form, under any name and from any path."""
+    with page.browser(Role.OPERATE) as browser, page.browser(Role.OBSERVE) as watcher:
+        ours, watching = cookie_of(browser), cookie_of(watcher)
+        said = [("Origin", page.address), (KEY_HEADER, browser.headers[KEY_HEADER])]
+    name = ours.partition("=")[0]
+    for cookies in (
+        [ours],
+        [f'prefs={{"theme":"dark"}}; {ours}'],
+        [f"flag; {ours}"],
+        [f"{ours}; {name}=x"],
+        [f"{name}=x; {ours}"],
+        [f"{name}=; =;;=; {ours} ;"],
+        [f"{name}=x", "flag", ours],
+        [f"{watching}; {ours}"],
+        [f"{ours}; {watching}"],
+    ):
+        headers = [*said, *(("Cookie", one) for one in cookies)]
+        answer = httpx.post(f"{page.address}/v1/stop", headers=headers, trust_env=False)
+        assert answer.status_code == 202, cookies
+    for cookies, code in ((f"{name}x={ours.partition('=')[2]}", 401), (f"x={ours}", 401), (watching, 403)):
+        headers = [*said, ("Cookie", cookies)]
+        assert httpx.post(f"{page.address}/v1/stop", headers=headers, trust_env=False).status_code == code
+
+
 def test_a_wrong_host_or_origin_is_refused_whatever_the_cookie(page):
     with page.browser(Role.OPERATE) as browser:
         own = page.address
