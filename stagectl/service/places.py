@@ -12,6 +12,8 @@ SOCKET_NAME = "stagectl.socket"
 SYSTEM_FOLDER = Path("/run/stagectl")
 SOCKET_MODE = 0o660
 _BACKLOG = 64
+_NOBODY = (errno.ECONNREFUSED, errno.ENOENT, errno.ENOTDIR)
+"""What connecting says where no service is; a live one with a full backlog says EAGAIN."""
 
 
 def default_socket() -> Path:
@@ -26,7 +28,7 @@ def default_socket() -> Path:
 
 
 def is_served(path: Path) -> bool:
-    """Tell whether a service answers on a socket's path."""
+    """Tell whether a socket's path is a service's, also of one that is too busy to answer, or not for us."""
     if not path.is_socket():
         return False
     asked = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -34,7 +36,7 @@ def is_served(path: Path) -> bool:
         asked.settimeout(1.0)
         asked.connect(str(path))
     except OSError as error:
-        return error.errno == errno.EACCES  # somebody's, and not for us: not to be taken either
+        return error.errno not in _NOBODY
     finally:
         asked.close()
     return True
@@ -50,7 +52,7 @@ def listen_unix(path: Path) -> socket.socket:
             raise LinkError(f"{path.parent}: others may put a socket of theirs here; give another path with --socket")
         if is_served(path):
             raise LinkError(f"{path}: a service listens here already; stop it, or give another path with --socket")
-        path.unlink(missing_ok=True)
+        _remove_dead(path)
         before = os.umask(0o777 & ~SOCKET_MODE)
         try:
             listening.bind(str(path))
@@ -59,11 +61,23 @@ def listen_unix(path: Path) -> socket.socket:
         listening.listen(_BACKLOG)
     except OSError as error:
         listening.close()
-        raise LinkError(f"{path}: can't listen: {error.strerror}; give another path with --socket") from error
+        raise LinkError(f"{path}: can't listen: {error.strerror or error}; give another path with --socket") from error
     except LinkError:
         listening.close()
         raise
     return listening
+
+
+def _remove_dead(path: Path) -> None:
+    """Remove a dead service's socket, and nothing else. Errors: LinkError."""
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(mode):
+        kind = "a symbolic link" if stat.S_ISLNK(mode) else "a folder" if stat.S_ISDIR(mode) else "a file"
+        raise LinkError(f"{path}: {kind} is here, no socket; remove it, or give another path with --socket")
+    path.unlink(missing_ok=True)
 
 
 def listen_tcp(port: int, option: str = "--tcp") -> socket.socket:

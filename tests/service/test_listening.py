@@ -1,5 +1,6 @@
 """Sockets, tokens, systemd and the state file: what stands between the service and everybody else on the machine."""
 
+import contextlib
 import json
 import os
 import socket
@@ -37,6 +38,53 @@ def test_the_socket_is_for_owner_and_group(tmp_path):
     listening.close()
     assert not is_served(path)
     listen_unix(path).close()  # a dead service's socket is no obstacle
+
+
+def test_a_service_too_busy_to_answer_keeps_its_socket(tmp_path):
+    path = tmp_path / "stage.socket"
+    with contextlib.ExitStack() as waiting, listen_unix(path) as listening:
+        last = waiting.enter_context(nonblocking())
+        while last.connect_ex(str(path)) == 0:
+            last = waiting.enter_context(nonblocking())
+        before = path.stat().st_ino
+        assert is_served(path)
+        with pytest.raises(LinkError, match="a service listens here already; stop it"):
+            listen_unix(path)
+        assert path.stat().st_ino == before
+        listening.accept()[0].close()
+        assert last.connect_ex(str(path)) == 0  # it is still reached here
+
+
+def nonblocking():
+    """A Unix socket that waits for nobody."""
+    made = socket.socket(socket.AF_UNIX)
+    made.setblocking(False)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("kind", "make"),
+    [
+        ("a file", lambda path: path.write_text("no socket")),
+        ("a folder", lambda path: path.mkdir()),
+        ("a symbolic link", lambda path: path.symlink_to(path.parent / "nowhere")),
+        ("a symbolic link", lambda path: path.symlink_to(listened_to_once(path.parent / "dead"))),
+    ],
+    ids=["file", "folder", "dangling link", "link to a dead socket"],
+)
+def test_what_is_no_socket_is_not_removed(tmp_path, kind, make):
+    path = tmp_path / "precious"
+    make(path)
+    before = path.lstat().st_ino
+    with pytest.raises(LinkError, match=f"precious: {kind} is here, no socket; remove it, or give another path"):
+        listen_unix(path)
+    assert path.lstat().st_ino == before
+
+
+def listened_to_once(path):
+    """The path of a dead service."""
+    listen_unix(path).close()
+    return path
 
 
 def test_a_folder_of_everybody_is_refused(tmp_path):
