@@ -3,10 +3,18 @@
 Beyond the limit everything is refused but a stop and what the operator asks, and of the connections that ask nothing
 the oldest make room, the operator's last: so there is always one left for whoever wants to stop the stage, and a lease
 is renewed whoever else is there. uvicorn's own limit refuses whatever comes, a stop too.
+
+Who reads nothing of what waits for it is let go of, or it would be counted until it goes by itself: uvicorn closes a
+connection only when all that was written to it has left, and waits as long before it writes more, a close frame too.
 """
 
+import array
+import asyncio
+import fcntl
 import json
-from collections.abc import Callable
+import termios
+from collections.abc import Callable, Collection
+from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -15,6 +23,10 @@ from stagectl.service.access import Application, Receive, Scope, Send
 CONNECTIONS_LIMIT = 100
 RESERVE_COUNT = 50
 """Beyond the limit, for stops and for the operator."""
+
+LOOK_S = 1.0
+_LOOKS_COUNT = 10
+"""In which a client reads nothing before it is let go of; looks and no time, as a host may stand still."""
 
 _STOP_PATH = "/v1/stop"
 _FROM_OPERATOR = "stagectl_from_operator"
@@ -74,3 +86,33 @@ class Admission:
             headers.append((b"content-length", str(len(body)).encode()))
             await send({"type": "http.response.start", "status": 503, "headers": headers})
             await send({"type": "http.response.body", "body": body})
+
+
+async def let_go_of_the_deaf(connections: Collection[Any]) -> None:
+    """Abort connections whose client reads nothing of what waits for it, until cancelled."""
+    seen: dict[Any, tuple[tuple[int, int], int]] = {}
+    while True:
+        now: dict[Any, tuple[tuple[int, int], int]] = {}
+        for one in list(connections):
+            unread = _unread_bytes(one.transport)
+            before, looks_count = seen.get(one, (unread, 0))
+            if not any(unread):
+                continue
+            now[one] = unread, looks_count + 1 if unread == before else 0
+            if now[one][1] >= _LOOKS_COUNT:
+                one.transport.abort()
+        seen = now
+        await asyncio.sleep(LOOK_S)
+
+
+def _unread_bytes(transport: asyncio.Transport) -> tuple[int, int]:
+    """Return what waits for a client here and in the kernel; none where all is in the kernel.
+
+    The kernel's part shows a slow reader: a Unix socket takes no more before three quarters of 200 kB are read.
+    """
+    here = transport.get_write_buffer_size()
+    if here == 0:
+        return 0, 0
+    in_kernel = array.array("i", [0])
+    fcntl.ioctl(transport.get_extra_info("socket").fileno(), termios.TIOCOUTQ, in_kernel)
+    return here, in_kernel[0]

@@ -25,6 +25,9 @@ from stagectl.service.used_keys import ANSWERS_COUNT
 
 _WAIT_STEP_S = 0.02
 _WAIT_MOST_S = 25.0
+SEND_S = 5.0
+"""How long a stream waits for room to write more."""
+
 _CODES: tuple[tuple[type[StagectlError], int], ...] = (
     (LeaseRefused, 423),
     (Busy, 409),
@@ -291,19 +294,21 @@ def _stream_route(app: FastAPI, desk: Desk) -> None:
         """Status and thinned-out samples, at the client's rate; a client that doesn't read is let go of."""
         await socket.accept()
         number = desk.scope.after(-1).last
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
-            while True:
-                scope = desk.scope
-                samples = scope.after(number if number <= scope.after(-1).last else 0)
-                number = samples.last
-                message = {
-                    "status": desk.status().model_dump(),
-                    "samples": {"columns": COLUMNS, "rows": [[_json(value) for value in row] for row in samples.rows]},
-                }
-                await asyncio.wait_for(socket.send_json(message), 5.0)
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(_closed(socket), 1.0 / rate_hz)
-                    return
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            with contextlib.suppress(TimeoutError):
+                while True:
+                    scope = desk.scope
+                    samples = scope.after(number if number <= scope.after(-1).last else 0)
+                    number = samples.last
+                    rows = [[_json(value) for value in row] for row in samples.rows]
+                    message = {"status": desk.status().model_dump(), "samples": {"columns": COLUMNS, "rows": rows}}
+                    await asyncio.wait_for(socket.send_json(message), SEND_S)
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(_closed(socket), 1.0 / rate_hz)
+                        return
+            await socket.close(
+                1013, f"there was no room for more in {SEND_S:g} s; read faster, or ask for a lower rate_hz"
+            )
 
 
 async def _closed(socket: WebSocket) -> None:

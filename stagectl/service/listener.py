@@ -9,7 +9,7 @@ from typing import Literal
 import uvicorn
 
 from stagectl.service.access import Application, Scope
-from stagectl.service.admission import Admission, Connection
+from stagectl.service.admission import Admission, Connection, let_go_of_the_deaf
 
 _CLOSE_S = 2.0
 _START_S = 10.0
@@ -70,9 +70,13 @@ class Listener:
                 self._ended()
 
     async def _serve(self) -> None:
-        await asyncio.gather(
-            *(server.serve(sockets=[listening]) for server, listening in zip(self._servers, self._sockets, strict=True))
-        )
+        looking = [asyncio.create_task(let_go_of_the_deaf(server.server_state.connections)) for server in self._servers]
+        served = zip(self._servers, self._sockets, strict=True)
+        try:
+            await asyncio.gather(*(server.serve(sockets=[listening]) for server, listening in served))
+        finally:
+            for task in looking:
+                task.cancel()
 
     def close(self) -> None:
         """Answer no more."""

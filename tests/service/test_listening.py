@@ -9,11 +9,13 @@ import threading
 import time
 from http.client import HTTPResponse
 
+import numpy as np
 import pytest
 
 from stagectl.client import Client
 from stagectl.errors import LinkError, ProfileError, RecordError, RequestError
-from stagectl.service import messages
+from stagectl.row import ROW
+from stagectl.service import admission, api, messages
 from stagectl.service.access import BODY_LIMIT_BYTES, LEASE_HEADER, Access, Role, header, read_tokens, role_of
 from stagectl.service.admission import CONNECTIONS_LIMIT, RESERVE_COUNT
 from stagectl.service.api import application
@@ -323,12 +325,100 @@ def test_no_crowd_keeps_the_operator_s_renewals_out(crowd):
     assert renewed(many.connect(), token) == 503
 
 
+UPGRADE = b"""GET /v1/stream?rate_hz=30 HTTP/1.1\r
+Host: s\r
+Connection: Upgrade\r
+Upgrade: websocket\r
+Sec-WebSocket-Version: 13\r
+Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r
+\r
+"""
+GOING_AWAY = b"\x88\x82\0\0\0\0\x03\xe9"
+
+
 def test_streams_up_to_the_limit_leave_room_for_a_stop(crowd):
     many, desk, client = crowd
-    upgrade = b"GET /v1/stream HTTP/1.1\r\nHost: s\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
-    upgrade += b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
-    answers = [many.connect(upgrade).recv(12) for _ in range(CONNECTIONS_LIMIT + 20)]
+    answers = [many.connect(UPGRADE).recv(12) for _ in range(CONNECTIONS_LIMIT + 20)]
     assert answers[0] == b"HTTP/1.1 101"
     assert answers[-1] == b"HTTP/1.1 403"
     assert client.stop().state == "off"
     assert desk.stop_asked
+
+
+@pytest.fixture
+def soon(monkeypatch):
+    """A service that loses its patience ten times as fast, and has room for three."""
+    monkeypatch.setattr(admission, "LOOK_S", 0.1)
+    monkeypatch.setattr(admission, "CONNECTIONS_LIMIT", 3)
+    monkeypatch.setattr(api, "SEND_S", 0.5)
+
+
+def is_refused(client):
+    """Whether there is no room for a client's request."""
+    try:
+        client.status()
+    except RequestError as error:
+        return "connections are open, the limit" in str(error)
+    return False
+
+
+def says_much(desk):
+    """Have streams more to say than kernel and service hold for one that does not read: 50 kB, ten times."""
+    for _ in range(10):
+        desk.scope.add(np.zeros(10_000, ROW))
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said_later"),
+    [(UPGRADE, b""), (UPGRADE, GOING_AWAY), (b"GET /openapi.json HTTP/1.1\r\nHost: s\r\n\r\n" * 50, b"")],
+    ids=["a stream", "a stream that says that it ends", "many answers"],
+)
+def test_a_client_that_does_not_read_is_counted_no_more(soon, crowd, asked, said_later):
+    many, desk, client = crowd
+    for _ in range(3):
+        assert many.connect(asked).recv(12) in (b"HTTP/1.1 101", b"HTTP/1.1 200")  # and reads no more
+    assert is_refused(client)
+    says_much(desk)
+    for one in many.sockets:
+        with contextlib.suppress(BrokenPipeError):  # let go of already
+            one.sendall(said_later)
+    give_up_s = time.monotonic() + 20.0
+    while is_refused(client):
+        assert time.monotonic() < give_up_s
+        time.sleep(0.1)
+
+
+def test_a_client_that_reads_slowly_reads_to_its_close_frame(soon, crowd):
+    many, desk, _ = crowd
+    stream = many.connect(UPGRADE)
+    assert stream.recv(12) == b"HTTP/1.1 101"
+    says_much(desk)
+    stream.settimeout(10.0)
+    heard, begun_s = b"", time.monotonic()
+    while piece := stream.recv(4096):
+        heard += piece
+        time.sleep(0.05)
+        if heard.endswith(b"lower rate_hz"):
+            break
+    assert time.monotonic() - begun_s > 3.0  # one that reads nothing is let go of after 1 s
+    opcodes, bodies = frames(heard.partition(b"\r\n\r\n")[2])
+    assert set(opcodes[:-1]) == {1}
+    assert opcodes[-1] == 8
+    assert bodies[-1].startswith(b"\x03\xf5")  # 1013: try again later
+
+
+def frames(text):
+    """The frames of a server's side of a WebSocket, whole ones only: opcodes and bodies."""
+    opcodes, bodies = [], []
+    while text:
+        length, begin = text[1], 2
+        if length == 126:
+            length, begin = int.from_bytes(text[2:4]), 4
+        elif length == 127:
+            length, begin = int.from_bytes(text[2:10]), 10
+        opcodes.append(text[0] & 0x0F)
+        bodies.append(text[begin : begin + length])
+        assert len(bodies[-1]) == length
+        text = text[begin + length :]
+    return opcodes, bodies

@@ -6,12 +6,15 @@ import json
 import os
 import socket
 import threading
+import time
 from pathlib import Path
 
 import pytest
 import websockets
 
+from stagectl.page import application
 from stagectl.page.feed import Feed
+from stagectl.service import admission
 from stagectl.service.access import Role
 from tests.service.daemon import servo_pid
 from tests.service.pages import PageServer
@@ -176,3 +179,53 @@ def test_a_page_that_does_not_read_is_let_go_of_and_the_others_hear_on(tmp_path)
     assert json.loads(heard[-1])["samples"]["rows"] == [[said - 1.0]]
     assert len(left) <= 100  # what waited for it, and then the end
     assert pages_count == 1
+
+
+@contextlib.contextmanager
+def loud_service(path):
+    """What a page hears of a service that says 200 kB fifty times a second."""
+    message = json.dumps({"status": {"text": "x" * 200_000}, "samples": {"columns": ["t_s"], "rows": []}})
+    over = threading.Event()
+
+    async def talk(stream):
+        while True:
+            await stream.send(message)
+            await asyncio.sleep(0.02)
+
+    async def serve():
+        async with websockets.unix_serve(talk, str(path)):
+            while not over.is_set():
+                await asyncio.sleep(0.05)
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()))
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(20.0)
+
+
+def test_a_page_that_does_not_read_is_counted_no_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(admission, "LOOK_S", 0.1)
+    monkeypatch.setattr(application, "_SEND_S", 0.5)
+    server = PageServer(tmp_path / "loud", tmp_path)
+    try:
+        with loud_service(tmp_path / "loud"), server.browser(Role.OBSERVE) as browser, socket.socket() as deaf:
+            cookie = "; ".join(f"{name}={value}" for name, value in browser.cookies.items())
+            deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            deaf.connect(("127.0.0.1", server.port))
+            deaf.sendall(
+                f"GET /v1/stream HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nOrigin: {server.address}\r\n"
+                f"Cookie: {cookie}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+            )
+            assert deaf.recv(12) == b"HTTP/1.1 101"
+            monkeypatch.setattr(admission, "CONNECTIONS_LIMIT", 1)
+            assert browser.get("/session").status_code == 503
+            give_up_s = time.monotonic() + 30.0
+            while browser.get("/session").status_code == 503:
+                assert time.monotonic() < give_up_s
+                time.sleep(0.1)
+    finally:
+        server.end()
