@@ -18,7 +18,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from stagectl.errors import RecordError
-from stagectl.record import Recorder, free_text
+from stagectl.record import Recorder, finish_left, free_text
+from stagectl.run_folder import give_back
 
 RECOVERY_LINK = "current"
 """In the session's folder: leads to the folder that rows of a dead servo belong to."""
@@ -54,7 +55,7 @@ class FlightRecorder:
         self._base: Recorder | None = None
         self._run: Recorder | None = None
         self._run_name = ""
-        self._run_rows_limit_count = run_rows_limit_count
+        self._run_rows_limit_count = self._goes_on_at_count = run_rows_limit_count
         self._disk = ThreadPoolExecutor(1, "runs")  # what waits for the disk while the stage moves
         self._next: _Next | None = None
         self._rows: deque[np.ndarray] = deque()
@@ -121,20 +122,24 @@ class FlightRecorder:
         while self._events and self._events[0][2] < self.rows_count - self._rows_held_count:
             self._events.popleft()  # of rows that are gone
         with self._policy():
-            if self._run is not None and self._next is None and self._run.rows_count >= self._run_rows_limit_count:
+            if self._run is not None and self._next is None and self._run.rows_count >= self._goes_on_at_count:
                 self.go_on_as(self._run_name, self.trigger)
-            self._take_next()
-            if self._run is not None:
-                self._run.append(rows)
+            try:
+                self._take_next()
+            finally:  # they have left the ring: where there is no other run, this one takes them
+                if self._run is not None:
+                    self._run.append(rows)
 
     def event(self, name: str, t_ns: int, row: int | None = None, **fields: Any) -> None:
         """Keep an event with the session, and with the run under way."""
         self._events.append((name, int(t_ns), self.rows_count, fields))
         with self._policy():
-            if self._base is not None:
-                self._base.event(name, t_ns, row, **fields)
-            if self._run is not None:
-                self._run.event(name, t_ns, **fields)
+            try:
+                if self._base is not None:
+                    self._base.event(name, t_ns, row, **fields)
+            finally:
+                if self._run is not None:
+                    self._run.event(name, t_ns, **fields)
 
     def save_snapshot(self, states: Mapping[str, np.ndarray]) -> None:
         """Keep the states that the session began from, and a run that began with it."""
@@ -176,8 +181,16 @@ class FlightRecorder:
             self._forget_next()
             run, self._run, self.trigger = self._run, None, ""
             if run is not None:
-                with contextlib.suppress(RecordError, OSError):
-                    run.abandon()
+                self._give_up(run)
+
+    def _give_up(self, run: Recorder) -> None:
+        """Let go of a run that the disk takes no more of; letting go waits for the disk, and the stage moves on."""
+        try:
+            self._lead_to(self.folder)
+        except RecordError:  # a dead servo's rows would go into the run: it is finished at the next opening
+            self._disk.submit(_let_go, run)
+        else:
+            self._disk.submit(_finish, run)
 
     def _tell(self, error: RecordError) -> None:
         if not self.trouble:
@@ -198,16 +211,20 @@ class FlightRecorder:
             if self._run is not None:
                 return
             self._begin_session()
-            folder = self._reserve(name)
             begun = {**self._manifest, "trigger": trigger, **({} if t_ns is None else {"start_t_ns": t_ns})}
-            run = Recorder(folder, begun, durable=True)
+            run = self._made(name, begun)
             try:
                 run.event("begin", t_ns or 0, trigger=trigger)
-                self._lead_to(folder)
+                self._lead_to(run.folder)
             except RecordError:
                 run.abandon()  # else it would record on without anybody to end it
                 raise
-            self._run, self._run_name, self.trigger, self.trouble = run, name, trigger, ""
+            self._take(run, name, trigger)
+
+    def _take(self, run: Recorder, name: str, trigger: str) -> None:
+        """Have rows go to this run from now on."""
+        self._run, self._run_name, self.trigger, self.trouble = run, name, trigger, ""
+        self._goes_on_at_count = self._run_rows_limit_count
 
     def go_on_as(self, name: str, trigger: str, end: Mapping[str, Any] | None = None) -> None:
         """Record into another folder from soon on, without a row lost or doubled; the run under way ends with `end`.
@@ -223,17 +240,36 @@ class FlightRecorder:
         self._next = _Next(self._disk.submit(self._made, name, begun), name, trigger, dict(end or {}))
 
     def _take_next(self) -> None:
-        """Go on in the next folder, where it is there. Errors: RecordError."""
+        """Go on in the next folder, where it is there; else in the one before. Errors: RecordError, policy "stop"."""
         if self._next is None or not self._next.made.done():
             return
         following, self._next, before = self._next, None, self._run
         try:
-            new = following.made.result()
+            new = self._led_to_next(following, before)
         except RecordError as error:
             if before is None:  # it was asked for, and nothing depends on it
                 self._tell(error)
                 return
-            raise
+            # The run before stands in for it, and is as long again before the next try: each may leave the disk fuller.
+            self._run_name, self.trigger = following.name, following.trigger
+            self._goes_on_at_count = before.rows_count + self._run_rows_limit_count
+            stays = RecordError(
+                f"{before.folder.name} can't go on in another folder, it takes all rows itself: {error}"
+            )
+            if self._on_full_disk == "go_on":
+                self._tell(stays)
+                return
+            raise stays from error
+        self._take(new, following.name, following.trigger)
+        if before is None:
+            self._say("run", "begun", run=new.folder.name, trigger=following.trigger)
+            return
+        self._say("run", f"goes on behind {before.folder.name}", run=new.folder.name, trigger=following.trigger)
+        self._disk.submit(self._close_continued, before, {**following.end, "continued_by": new.folder.name})
+
+    def _led_to_next(self, following: "_Next", before: Recorder | None) -> Recorder:
+        """Return the next run when all of the one before is in its file. Errors: RecordError; then there is no next."""
+        new = following.made.result()
         try:
             if before is not None:
                 before.flush()  # a recovery goes on behind the last row there
@@ -241,28 +277,28 @@ class FlightRecorder:
         except RecordError:
             self._disk.submit(_remove, new)
             raise
-        self._run, self._run_name, self.trigger, self.trouble = new, following.name, following.trigger, ""
-        if before is None:
-            self._say("run", "begun", run=new.folder.name, trigger=following.trigger)
-            return
-        self._say("run", f"goes on behind {before.folder.name}", run=new.folder.name, trigger=following.trigger)
-        self._disk.submit(self._close_continued, before, {**following.end, "continued_by": new.folder.name})
+        return new
 
-    def _made(self, name: str, manifest: dict[str, Any]) -> Recorder:
-        return Recorder(self._reserve(name), manifest, durable=True)
+    def _made(self, name: str, manifest: dict[str, Any], durable: bool = True) -> Recorder:
+        folder = self._reserve(name)
+        try:
+            return Recorder(folder, manifest, durable=durable)
+        except RecordError:
+            give_back(folder)
+            raise
 
     def _close_continued(self, run: Recorder, end: Mapping[str, Any]) -> None:
         try:
             run.close(end)
         except (RecordError, OSError) as error:
-            run.abandon()  # its rows are in the file: the next start marks it as recovered
+            _finish(run)  # its rows are in the file
             self._say("record_lost", str(error))
 
     def _forget_next(self) -> None:
         """Remove the folder that a run was to go on in, as soon as it is made."""
         following, self._next = self._next, None
         if following is not None:
-            following.made.add_done_callback(lambda made: _remove(made.result()) if made.exception() is None else None)
+            self._disk.submit(_remove_made, following.made)
 
     def end_run(self, end: Mapping[str, Any] | None = None) -> Path | None:
         """Close the run under way and return its folder; None where there was none. Errors: RecordError."""
@@ -303,7 +339,7 @@ class FlightRecorder:
     def _save(self, name: str, trigger: str, text: str, pieces: list[np.ndarray], events: list[tuple]) -> None:
         try:
             start = {"start_t_ns": int(pieces[0]["t_ns"][0])}
-            saved = Recorder(self._reserve(name), {**self._manifest, "trigger": trigger, **start})
+            saved = self._made(name, {**self._manifest, "trigger": trigger, **start}, durable=False)
             try:
                 for event, t_ns, row, fields in events:
                     saved.event(event, t_ns, row, **fields)
@@ -329,8 +365,29 @@ class _Next(NamedTuple):
     """How the run before it ends."""
 
 
-def _remove(run: Recorder) -> None:
-    """Remove a run that never got a row."""
+def _let_go(run: Recorder) -> None:
+    """Let go of a run's files as they are."""
     with contextlib.suppress(OSError):
         run.abandon()
+
+
+def _finish(run: Recorder) -> None:
+    """Let go of a run that can't be closed, and mark what is in its files as all of it: else it could never be removed.
+
+    Where the disk has no room even for that, the next opening does it.
+    """
+    _let_go(run)
+    with contextlib.suppress(RecordError, OSError):
+        finish_left(run.folder, None)
+
+
+def _remove_made(made: Future[Recorder]) -> None:
+    """Remove a run that was just made; one that could not be made has left nothing."""
+    if made.exception() is None:
+        _remove(made.result())
+
+
+def _remove(run: Recorder) -> None:
+    """Remove a run that never got a row."""
+    _let_go(run)
     shutil.rmtree(run.folder, ignore_errors=True)

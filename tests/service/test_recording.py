@@ -1,6 +1,7 @@
 """What a session leaves: runs of powered motion, the last seconds before a fault, and no more than it may."""
 
 import asyncio
+import contextlib
 import json
 import math
 import os
@@ -90,6 +91,102 @@ def test_a_long_run_goes_on_in_another_folder_without_a_row_lost(tmp_path):
     assert [run.manifest["end"].get("continued_by") for run in runs] == [*(folder.name for folder in folders[1:]), None]
     assert {path for path in tmp_path.iterdir() if path.is_dir()} == {session.folder, *folders}
     assert len(said) == 3
+
+
+class FullWhileAsked:
+    """Makes the folders of a session, or says that the disk is full; counts how often it was asked then."""
+
+    def __init__(self, root: Path):
+        self.root, self.full, self.refused_count = root, False, 0
+
+    def __call__(self, name: str) -> Path:
+        if self.full:
+            self.refused_count += 1
+            raise RecordError("no space for a folder")
+        return reserve(self.root, name)
+
+
+def record_past_a_refused_folder(session: FlightRecorder, folders: FullWhileAsked) -> int:
+    """Hand over 400 rows of a run that should go on at 100; returns how often that was an error."""
+    session.begin_run("motion", "arm", 0)
+    folders.full = True
+    errors_count = 0
+    for first in range(0, 400, 20):
+        try:
+            session.append(rows_from(first, 20))
+        except RecordError:
+            errors_count += 1
+        session._disk.submit(int).result()  # the thread has tried what it was asked for
+    return errors_count
+
+
+@pytest.mark.parametrize("policy", ["stop", "go_on"])
+def test_a_run_that_can_not_go_on_in_another_folder_keeps_all_its_rows(tmp_path, policy):
+    """240 of 400 were left, with holes of 20, and each second block made another try."""
+    folders, said = FullWhileAsked(tmp_path), []
+    session = FlightRecorder(
+        reserve(tmp_path, "session"), {}, folders, 100, policy, lambda event, text, **fields: said.append(text), 100
+    )
+    errors_count = record_past_a_refused_folder(session, folders)
+    first = session.run_folder
+    assert first is not None
+    assert folders.refused_count == 3  # at 100, 200 and 300 rows
+    assert errors_count == (3 if policy == "stop" else 0)
+    assert "can't go on in another folder, it takes all rows itself: no space for a folder" in session.trouble
+    assert len(said) == 1
+    folders.full = False
+    end = record_until_it_goes_on(session, 400)
+    assert session.trouble == ""
+    second = session.end_run()
+    session.close()
+    assert first != second
+    rows = np.concatenate([read_run(folder).rows for folder in (first, second)])
+    assert rows["cycle"].tolist() == list(range(end))
+
+
+def test_a_run_that_another_was_to_follow_stands_in_for_it(tmp_path):
+    """The client ended its run in mid motion, and there is no room for the motion's own."""
+    folders = FullWhileAsked(tmp_path)
+    session = FlightRecorder(reserve(tmp_path, "session"), {}, folders, 100, "go_on")
+    session.begin_run("asked", "request", 0)
+    folders.full = True
+    session.go_on_as("arm", "arm", {"stop": "OPERATOR"})
+    session._disk.submit(int).result()
+    session.append(rows_from(0, 50))
+    assert (session.trigger, session.trigger_soon) == ("arm", "arm")
+    run = session.end_run({"stop": "FINISHED"})
+    session.close()
+    assert read_run(run).rows["cycle"].tolist() == list(range(50))
+
+
+def test_a_folder_that_no_run_could_be_begun_in_goes_again(tmp_path):
+    with small_disk(tmp_path / "disk") as disk:
+        session = flight(disk, policy="go_on")
+        (disk / "others").write_bytes(bytes(1 << 20))  # what is left is less than a run keeps free
+        session.begin_run("motion", "arm", 0)
+        session.go_on_as("asked", "request")
+        session._disk.submit(int).result()
+        assert "can't begin a run" in session.trouble
+        session.close()
+        assert [path for path in disk.iterdir() if path.is_dir()] == [session.folder]
+
+
+def test_an_event_that_the_session_has_no_room_for_is_in_the_run(tmp_path):
+    with small_disk(tmp_path / "disk", 12 << 20) as disk:
+        session = flight(disk)
+        session.begin_run("motion", "arm", 0)
+        room = os.statvfs(disk)
+        (disk / "others").write_bytes(bytes(room.f_bavail * room.f_frsize))
+        last = 0
+        with contextlib.suppress(RecordError):
+            while last < 1000:
+                last += 1
+                session.event("news", 0, number=last)
+        assert "can't write the run" in session.trouble
+        run = session.run_folder
+        session.abandon()
+        assert read_run(session.folder).events[-1]["number"] == last
+        assert read_run(run).events[-1]["number"] == last
 
 
 def test_a_service_that_dies_as_a_run_goes_on_loses_and_doubles_no_row(tmp_path):
@@ -549,6 +646,82 @@ def test_nothing_waits_for_the_disk_while_the_stage_moves(tmp_path, monkeypatch)
     cycles = np.concatenate([read_run(asked).rows, read_run(armed).rows])["cycle"].tolist()
     assert cycles == list(range(cycles[0], end))
     assert read_run(asked).manifest["end"] == {"stop": "OPERATOR", "continued_by": armed.name}
+
+
+def test_a_disk_that_is_full_and_slow_holds_up_no_motion_that_goes_on(tmp_path, monkeypatch):
+    """Letting go of a run syncs its files twice: the servo stopped with SUPERVISOR_SILENT meanwhile."""
+    moves = threading.Event()
+    fsync, fdatasync = os.fsync, os.fdatasync
+
+    def slowly(really):
+        def sync(descriptor):
+            assert moves.wait(5.0), "the stage's thread waits for the disk"
+            really(descriptor)
+
+        return sync
+
+    with small_disk(tmp_path / "disk", 12 << 20) as disk:
+        session = flight(disk, policy="go_on")
+        session.begin_run("motion", "arm", 0)
+        folder = session.run_folder
+        (disk / "others").write_bytes(bytes(5 << 20))
+        monkeypatch.setattr(os, "fsync", slowly(fsync))
+        monkeypatch.setattr(os, "fdatasync", slowly(fdatasync))
+        session.go_on_as("asked", "request")  # not made when the disk is full, and to be removed
+        noise, first = np.random.default_rng(1), 0
+        began_s = time.monotonic()
+        while session.run_folder is not None:
+            rows = rows_from(first, 250)
+            rows["sensor_bytes"] = noise.integers(0, 256, rows["sensor_bytes"].shape)
+            session.append(rows)
+            first += 250
+        assert "can't write the run" in session.trouble
+        assert time.monotonic() - began_s < 2.0
+        moves.set()
+        session.close()
+        assert read_run(folder).rows.size > 1000
+        assert {path for path in disk.iterdir() if path.is_dir()} == {session.folder, folder}
+
+
+def test_a_run_that_is_not_wanted_any_more_is_removed_without_a_wait(tmp_path, monkeypatch):
+    moves = threading.Event()
+    fsync = os.fsync
+
+    def slowly(descriptor):
+        assert moves.wait(5.0), "the stage's thread waits for the disk"
+        fsync(descriptor)
+
+    session = flight(tmp_path)
+    session.go_on_as("asked", "request")
+    session._disk.submit(int).result()  # it is there, and has no rows yet
+    monkeypatch.setattr(os, "fsync", slowly)
+    began_s = time.monotonic()
+    session.go_on_as("arm", "arm")
+    assert time.monotonic() - began_s < 2.0
+    moves.set()
+    session.close()
+    assert run_folders(tmp_path) == [session.folder]
+
+
+def test_a_run_that_filled_the_disk_can_be_removed_while_its_session_lasts(tmp_path):
+    with small_disk(tmp_path / "disk", 12 << 20) as disk:
+        session = flight(disk, policy="go_on")
+        session.begin_run("motion", "arm", 0)
+        folder, first = session.run_folder, 0
+        while session.run_folder is not None:
+            session.append(rows_from(first, 250))
+            first += 250
+            if first == 2000:
+                room = os.statvfs(disk)
+                (disk / "others").write_bytes(bytes(room.f_bavail * room.f_frsize))
+        session._disk.submit(int).result()
+        assert read_run(folder).manifest["record"]["state"] == "recovered"
+        assert session.recovery_folder.resolve() == session.folder  # a dead servo's rows go into no run that may go
+        assert [gone.folder for gone in prune(disk, 0.0, 1e9, 0.0)] == [folder]
+        (disk / "others").unlink()
+        session.begin_run("motion", "arm", 0)
+        assert session.trouble == ""
+        session.close()
 
 
 def test_a_run_that_was_asked_for_ends_also_before_it_is_there(tmp_path):
