@@ -629,10 +629,12 @@ def _finish_recovered(folder: Path, manifest: dict, recovery: Recovery, whole: d
     (folder / _RESERVE).unlink(missing_ok=True)
 
 
-def recover_orphans(ring_folder: Path = SHARED_MEMORY) -> list[tuple[Path, Recovery | RecordError]]:
+def recover_orphans(
+    ring_folder: Path = SHARED_MEMORY, runs_root: Path | None = None
+) -> list[tuple[Path, Recovery | RecordError]]:
     """Recover each ring of this user whose servo is dead into the run that it names; one bad ring stops no other.
 
-    Returns (ring, what was saved or why not) for each.
+    `runs_root`: only rings of runs below that folder. Returns (ring, what was saved or why not) for each.
     """
     outcomes: list[tuple[Path, Recovery | RecordError]] = []
     for ring_path in own_rings(Path(ring_folder)):
@@ -640,6 +642,13 @@ def recover_orphans(ring_folder: Path = SHARED_MEMORY) -> list[tuple[Path, Recov
             continue
         try:
             folder = RingReader(ring_path).run_folder
+        except RecordError as error:
+            if runs_root is None:  # else nobody knows whose it is
+                outcomes.append((ring_path, error))
+            continue
+        if runs_root is not None and (folder is None or runs_root.resolve() not in folder.resolve().parents):
+            continue
+        try:
             if folder is None:
                 raise RecordError(f"{ring_path}: names no run; recover it into its run, or remove the file")
             outcomes.append((ring_path, recover(ring_path, folder)))

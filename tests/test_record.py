@@ -626,6 +626,22 @@ def test_orphans_are_found_and_one_bad_ring_stops_no_other(tmp_path):
     living.close()
 
 
+def test_orphans_of_one_folder_are_recovered_and_others_wait_for_theirs(tmp_path):
+    shared = tmp_path / "shm"
+    shared.mkdir()
+    folders = {"a": "", "b": tmp_path / "one" / "run", "c": tmp_path / "two" / "run"}
+    for name, folder in folders.items():
+        ring = RingWriter(shared / f"stagectl-{name}.ring", slots_count=64, run_folder=folder)
+        write_rows(ring, noisy_rows(20))
+        ring.close()
+        if folder:
+            Recorder(folder, {}).abandon()
+    (shared / "stagectl-d.ring").write_bytes(b"of another version")
+    outcomes = {path.name: outcome for path, outcome in recover_orphans(shared, tmp_path / "one")}
+    assert outcomes == {"stagectl-b.ring": Recovery(20, 0)}
+    assert sorted(path.name for path in shared.iterdir()) == [f"stagectl-{name}.ring" for name in "acd"]
+
+
 @pytest.mark.parametrize("whose", ["a pipe", "a link", "another's"])
 def test_what_others_put_into_shared_memory_is_left_alone(tmp_path, monkeypatch, whose):
     shared = tmp_path / "shm"

@@ -11,8 +11,9 @@ import numpy as np
 
 from stagectl.errors import RecordError, RequestError
 from stagectl.flight_recorder import FlightRecorder
+from stagectl.left_runs import finish_left_runs
 from stagectl.profile import Profile
-from stagectl.record import read_manifest
+from stagectl.record import read_manifest, recover_orphans
 from stagectl.recording_trigger import Trigger, TriggerWatch
 from stagectl.retention import prune
 from stagectl.row import ROW
@@ -43,6 +44,7 @@ class Recording:
         self._left_count = 0
         self._name_after_motion = ""  # of the run that was asked for while a motion's was under way
         self._window: tuple[int, int] | None = None  # rows of the session, the end of which is still to come
+        self._unsaved: set[Path] = set()  # what a session left and nobody could save yet
 
     def factory(self, profile: Profile) -> Callable[[Path, dict[str, Any]], FlightRecorder]:
         """Return what makes the recorder of a session with this profile."""
@@ -195,6 +197,23 @@ class Recording:
             return  # given back already, or not ours
         if rows_count == 0:
             shutil.rmtree(session, ignore_errors=True)
+
+    def save_left(self) -> None:
+        """Save rows and end runs that sessions left behind whose disk was full; to be called while none is open."""
+        unsaved: set[Path] = set()
+        try:
+            outcomes = [*recover_orphans(runs_root=self._runs_root), *finish_left_runs(self._runs_root)]
+        except OSError as error:  # the opening meets it too, and says what to do
+            self._log.say("not_recovered", str(error))
+            return
+        for place, outcome in outcomes:
+            if not isinstance(outcome, RecordError):
+                self._log.say("recovered", str(outcome), place=str(place))
+                continue
+            unsaved.add(place)
+            if place not in self._unsaved:  # it is tried again every few seconds
+                self._log.say("not_recovered", str(outcome), place=str(place))
+        self._unsaved = unsaved
 
     # ---- retention -------------------------------------------------------------------------------------------
 

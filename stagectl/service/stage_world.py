@@ -62,6 +62,9 @@ class StageWorld(StageState):
             return
         self._wait_for(_OPENING)
         self._notifier.allow(_CONNECT_S)
+        self._recording.save_left()
+        if self._leaving:
+            return
         folder: Path | None = None
         self._opening = True
         try:

@@ -19,7 +19,7 @@ from stagectl.profile import PROFILES_FOLDER
 from stagectl.record import MANIFEST, Recorder, Recovery, read_run, recover, recover_orphans
 from stagectl.requests import Phase
 from stagectl.retention import AGES, KEEP, prune
-from stagectl.ring import RingWriter
+from stagectl.ring import SHARED_MEMORY, RingWriter
 from stagectl.row import new_rows
 from stagectl.run_folder import reserve
 from stagectl.runs import list_runs, run_folders
@@ -722,6 +722,50 @@ def test_a_run_that_filled_the_disk_can_be_removed_while_its_session_lasts(tmp_p
         session.begin_run("motion", "arm", 0)
         assert session.trouble == ""
         session.close()
+
+
+def test_what_a_full_disk_left_is_saved_when_the_stage_is_opened_again(bench):
+    """Not only when the service starts again, which may be in months."""
+    root = bench.settings.runs_root
+    left, unheld, living = (flight(root) for _ in range(3))
+    rings = [SHARED_MEMORY / f"stagectl-{os.getpid()}-{time.monotonic_ns()}-{name}.ring" for name in ("left", "living")]
+    writers = []
+    for session, path in zip((left, living), rings, strict=True):
+        session.begin_run("motion", "arm", 0)
+        writers.append(RingWriter(path, 1024, run_folder=session.recovery_folder.absolute()))
+        for row in rows_from(0, 300):
+            writers[-1].write(row.reshape(1))
+    unheld.begin_run("motion", "arm", 0)
+    gone = SHARED_MEMORY / f"stagectl-{os.getpid()}-{time.monotonic_ns()}-gone.ring"
+    RingWriter(gone, 16, run_folder=root.absolute() / "removed").close()
+    runs = [session.run_folder for session in (left, unheld, living)]
+    try:
+        for session in (left, unheld):
+            session.abandon()
+        writers[0].close()
+        bench.loop.reread()
+        bench.loop.step()
+        bench.until(lambda: bench.loop._state == "idle")
+        bench.loop.reread()
+        bench.loop.step()
+        bench.until(lambda: bench.loop._state == "idle")
+        assert read_run(runs[0]).rows["cycle"].tolist() == list(range(300))
+        assert [read_run(run).manifest["record"]["state"] for run in runs] == ["recovered", "recovered", "recording"]
+        assert [path.exists() for path in rings] == [False, True]
+        entries = bench.log.last(1000)
+        assert [entry.fields["place"] for entry in entries if entry.event == "not_recovered"] == [str(gone)]  # once
+    finally:
+        for path in (*rings, gone):
+            path.unlink(missing_ok=True)
+    living.abandon()
+    writers[1].close()
+
+
+def test_a_service_that_ends_while_it_saves_what_was_left_opens_nothing(tmp_path, monkeypatch):
+    made = Bench(tmp_path)
+    monkeypatch.setattr(made.loop._recording, "save_left", made.loop.leave)  # as a SIGTERM meanwhile
+    made.loop.run()
+    assert not made.settings.runs_root.exists()
 
 
 def test_a_run_that_was_asked_for_ends_also_before_it_is_there(tmp_path):
