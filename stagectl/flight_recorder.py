@@ -39,10 +39,12 @@ class FlightRecorder:
         on_full_disk: Literal["stop", "go_on"],
         say: Callable[..., object] = lambda event, text, **fields: None,
         run_rows_limit_count: float = math.inf,
+        before_end: Callable[[], object] = lambda: None,
     ):
         """Begin a session in `folder`; `reserve` makes folders for runs, `say` tells at once what becomes of them.
 
         A run that has `run_rows_limit_count` rows goes on in another folder, without a row lost or doubled.
+        `before_end` is called when the session's last rows are there, and can still save some of them.
         """
         self.folder = folder
         self.rows_count = 0
@@ -56,6 +58,7 @@ class FlightRecorder:
         self._run: Recorder | None = None
         self._run_name = ""
         self._run_rows_limit_count = self._goes_on_at_count = run_rows_limit_count
+        self._before_end = before_end
         self._disk = ThreadPoolExecutor(1, "runs")  # what waits for the disk while the stage moves
         self._next: _Next | None = None
         self._rows: deque[np.ndarray] = deque()
@@ -156,6 +159,7 @@ class FlightRecorder:
 
     def close(self, end: Mapping[str, Any] | None = None) -> None:
         """End the run under way and the session."""
+        self._before_end()
         self.end_run(end)
         self._disk.shutdown()
         if self._base is not None:

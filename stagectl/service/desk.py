@@ -316,7 +316,7 @@ class Desk:
             self._refuse_when_closed()
             if self._record_request is not None:
                 raise Busy("another client asks the same just now; ask again")
-            if self._state is State.OFF:
+            if self.profile is None:
                 raise Busy("there is nothing to record: the stage is not connected")
             self._record_request = name
             self._keep(key, "record", name)

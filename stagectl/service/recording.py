@@ -61,6 +61,7 @@ class Recording:
                 limits.on_full_disk,
                 self._log.say,
                 min(round(limits.run_length_s * rate_hz), room_count),
+                self._save_begun_window,
             )
             if profile.record.when == ALWAYS:
                 try:
@@ -155,11 +156,21 @@ class Recording:
 
     def save_event(self) -> None:
         """Write what is around the event as a run, once its end is there."""
+        if self._recorder is not None and self._window is not None and self._recorder.rows_count >= self._window[1]:
+            self._save_window("around an event")
+
+    def _save_begun_window(self) -> None:
+        """Write what there is around an event whose end does not come any more: the session ends."""
+        self.save_event()
+        if self._window is not None:
+            self._save_window("around an event, to the session's end")
+
+    def _save_window(self, text: str) -> None:
         flight, asked, watch, window = self._recorder, self._asked, self._watch, self._window
-        if flight is None or asked is None or watch is None or window is None or flight.rows_count < window[1]:
+        if flight is None or asked is None or watch is None or window is None:
             return
         self._window, self._left_count = None, self._left_count - 1
-        flight.save_window(f"service-{asked.name}", watch.trigger.text, "around an event", *window)
+        flight.save_window(f"service-{asked.name}", watch.trigger.text, text, *window)
 
     def folder(self, session: Path) -> Path:
         """Return the run that rows go to now, the session's own folder where there is none."""
@@ -190,7 +201,7 @@ class Recording:
 
     def discard(self, session: Path) -> None:
         """Remove the folder of a session that did not come about, where it holds no row."""
-        self._recorder = None
+        self._recorder = self._window = None
         try:
             rows_count = read_manifest(session)["record"].get("rows_count", -1)
         except RecordError:

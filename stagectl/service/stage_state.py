@@ -141,7 +141,10 @@ class StageState:
             self._recording.wait_for(None if isinstance(trigger, str) else trigger)
         self._recording.save_event()
         asked = self.desk.next_record_request()
-        if asked is None or self._stage is None or self._opening:
+        if asked is None:
+            return
+        if self._stage is None or self._opening:
+            self._log.say("record", f"{asked or 'end'}: not done, the stage was let go of meanwhile")
             return
         if asked == "":
             self._recording.end_on_request(self._state in states.POWERED)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stagectl.errors import RecordError
+from stagectl.errors import LinkError, RecordError
 from stagectl.flight_recorder import FlightRecorder
 from stagectl.left_runs import finish_left_runs
 from stagectl.profile import PROFILES_FOLDER
@@ -24,7 +24,7 @@ from stagectl.row import new_rows
 from stagectl.run_folder import reserve
 from stagectl.runs import list_runs, run_folders
 from stagectl.service import messages
-from stagectl.service.desk import Unfit
+from stagectl.service.desk import Busy, Unfit
 from stagectl.service.run_list import RunList
 from tests.service.test_stage_loop import Bench
 from tests.small_disk import small_disk
@@ -766,6 +766,51 @@ def test_a_service_that_ends_while_it_saves_what_was_left_opens_nothing(tmp_path
     monkeypatch.setattr(made.loop._recording, "save_left", made.loop.leave)  # as a SIGTERM meanwhile
     made.loop.run()
     assert not made.settings.runs_root.exists()
+
+
+def test_a_run_is_not_asked_for_where_there_is_no_session(bench):
+    bench.loop._break(RecordError("test"))
+    assert bench.status.state == "fault"
+    for name in ("watch", ""):
+        with pytest.raises(Busy, match="nothing to record: the stage is not connected"):
+            bench.desk.ask_to_record(name)
+
+
+@pytest.mark.parametrize("end", ["service", "session", "servo"])
+def test_an_event_whose_window_the_end_of_the_session_cuts_is_saved_as_far_as_it_goes(bench, end):
+    bench.desk.set_trigger(messages.SetTrigger(error_m=1e-3, before_s=0.05, after_s=1.5, count=2, name="late"))
+    bench.loop.step()
+    observe = bench.loop._observe
+    first = []
+
+    def late(rows):
+        rows = rows.copy()
+        first.extend(rows["cycle"][:1] if not first else ())
+        rows["run_phase"] = int(Phase.TRACKING)
+        rows["setpoint_position_m"] = 0.0
+        rows["end_position_m"] = np.where(rows["cycle"] >= first[0] + 10, 2e-3, 0.0)
+        observe(rows)
+
+    stage = bench.loop._stage
+    link = stage.link
+    stage._observe = late
+    bench.loop.step()
+    bench.loop.step()
+    assert runs_of(bench, "late") == []
+    if end == "service":
+        bench.loop.leave()
+        bench.loop.run()
+    elif end == "session":
+        bench.loop.reread()
+        bench.loop.step()
+    else:
+        bench.loop._break(LinkError("test: as a servo that is gone"))
+    (folder,) = runs_of(bench, "late")
+    run = read_run(folder)
+    assert run.manifest["record"]["state"] == "closed"
+    assert run.rows["cycle"][50] == first[0] + 10
+    assert run.rows["t_ns"][-1] == link.rows.read_last(1)["t_ns"][0]
+    assert bench.loop._recording._left_count == 1
 
 
 def test_a_run_that_was_asked_for_ends_also_before_it_is_there(tmp_path):

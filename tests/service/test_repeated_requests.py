@@ -8,6 +8,7 @@ import pytest
 
 from stagectl.client import Client
 from stagectl.errors import JogOver, LinkError, RequestError
+from stagectl.profile import load_profile
 from stagectl.service import messages
 from stagectl.service.desk import Desk, Unfit
 from stagectl.service.lease import LeaseRefused
@@ -272,8 +273,8 @@ def test_who_waits_for_a_command_hears_its_end_whatever_keys_are_used_meanwhile(
     one.desk.submit("jog", messages.JogBy(distance_m=STEP_M), "long", one.token)
     order = one.desk.next_order()
     order.begin()
+    one.desk.profile = load_profile("single-axis")
     for k in range(ANSWERS_COUNT + 1):
-        one.desk._state = State.IDLE
         one.desk.ask_to_record("", f"r{k}")
         one.desk.next_record_request()
     assert one.desk.command("long").state == "running"
