@@ -196,8 +196,10 @@ class Desk:
         return self._stop_reason
 
     def stopped(self) -> None:
-        """The stage was brought to rest."""
-        self._stop.clear()
+        """The stage was brought to rest; what waited when that was asked for is not begun."""
+        with self._lock:  # whoever asked may be on the way here still: what waits must not come before that
+            self._drop_waiting(self._stop_reason)
+            self._stop.clear()
 
     def lease_left_s(self) -> float:
         """Return how long the stage may still move."""
@@ -301,7 +303,10 @@ class Desk:
         return messages.TakenLease(holder=lease.holder, left_s=left_s, duration_s=lease.duration_s, token=lease.token)
 
     def ask_to_stop(self, reason: str) -> None:
-        """Have the stage brought to rest; needs no lease. What waits is not begun."""
+        """Have the stage brought to rest; needs no lease. What waits is not begun.
+
+        The word itself waits for no lock: others hold that while they write to the log.
+        """
         self._stop_reason = reason
         self._stop.set()
         with self._lock:

@@ -1,5 +1,8 @@
 """How a stage with a micro comes to rest where that was asked for: nothing is sent off, and nothing thrown back."""
 
+import threading
+import time
+
 import numpy as np
 import pytest
 
@@ -61,3 +64,31 @@ def test_power_goes_only_once_what_braked_the_macro_is_gone(armed):
     assert rows["setpoint_velocity_m_per_s"][-1] == 0.0
     soon = (truth["t_ns"] > rows["t_ns"][-1]) & (truth["t_ns"] < rows["t_ns"][-1] + 10_000_000)
     assert np.abs(truth["macro_velocity_m_per_s"][soon]).max() < 0.5e-3
+
+
+def test_a_stop_that_is_obeyed_before_it_is_answered_lets_nothing_begin(tmp_path):
+    """Whoever asks is held up behind the word itself: the stage's thread may see to it and look for work meanwhile."""
+    bench = Bench(tmp_path)
+    bench.loop.show()
+    bench.until(lambda: bench.status.state == "idle")
+    bench.loop.step()
+    bench.take()
+    key = bench.begin("home", messages.Home())
+    asks = threading.Thread(target=bench.desk.ask_to_stop, args=("anna",))
+    with bench.desk._lock:  # others wait for it; this thread, which is the stage's, does not
+        asks.start()
+        give_up_s = time.monotonic() + 10.0
+        while not bench.desk.stop_asked:
+            assert time.monotonic() < give_up_s, "a stop waits for a client that has the desk's lock"
+            time.sleep(1e-3)
+        for _ in range(3):
+            bench.loop.step()
+    asks.join()
+    home = bench.desk.command(key)
+    assert (home.state, home.error.kind) == ("failed", "Busy")
+    assert home.text == "home: stopped before it began: anna"
+    assert (bench.status.state, bench.desk.stop_asked) == ("idle", False)
+    assert "moving" not in [entry.fields["state"] for entry in bench.log.last(200) if entry.event == "state"]
+    assert bench.do("arm", messages.Arm()).error.message.endswith("home it first")  # what comes later is heard again
+    bench.loop.leave()
+    bench.loop.run()
