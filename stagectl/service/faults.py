@@ -35,7 +35,8 @@ _REMEDY = {
 _ERROR_REMEDY: dict[type[StagectlError], str] = {
     ProfileError: "correct the profile, then acknowledge",
     LinkError: "check cables and power, then acknowledge: the stage is opened anew",
-    DriveError: "read the drive, clear its cause, then acknowledge",
+    DriveError: "read the drive, clear its cause, then acknowledge; a profile that was corrected is read before that "
+    "where the service is reloaded",
     TimingError: "free the host of other work, then acknowledge",
     RecordError: "free space or mend the permissions of the runs' folder, then acknowledge",
 }

@@ -8,7 +8,6 @@ from collections.abc import Callable
 
 from stagectl.errors import DriveError, LinkError, ProfileError, RequestError, StagectlError
 from stagectl.outcome import Outcome
-from stagectl.profile import load_profile
 from stagectl.requests import Phase
 from stagectl.service import faults, messages, recording, states
 from stagectl.service.desk import Order
@@ -44,7 +43,7 @@ class StageLoop(StageWatch):
     def step(self) -> None:
         """Do the next thing: a command, a look at the stage, or a try to open it."""
         self._tick()
-        if self._rereading and self._state in (State.OFF, State.IDLE):
+        if self._rereading and self._may_open_another:
             self._reread()
         elif self.desk.stop_asked:
             self._come_to_rest()
@@ -209,8 +208,9 @@ class StageLoop(StageWatch):
         stage = self._stage
         if stage is None or self._needs_anew(stage):
             self._close_stage()
+            if self._fault.kind == ProfileError.__name__:
+                self._profile = None  # it was to be corrected first, and is read with no further word
             self._enter(Event.LET_GO, "acknowledged")
-            self._retry_at_s = 0.0
         else:
             try:
                 again = stage.acknowledge()
@@ -224,19 +224,20 @@ class StageLoop(StageWatch):
             self._enter(Event.ACKNOWLEDGE, "acknowledged")
         self._fault = None
         self._memory.keep(fault=None)
+        if self._stage is None:
+            self._open_anew()
         self._finish(order, "acknowledged; nothing was enabled")
 
     def _do_backend(self, order: Order) -> None:
-        if self._state not in (State.OFF, State.IDLE):
-            raise RequestError(f"the world can be changed without power only; the state is {self._state}: stop first")
+        self._refuse_unless_free("the world can be changed")
         try:
-            profile = self._profile if self._profile is not None else load_profile(self._profile_asked)
+            profile = self._profile_as_read()
             chosen = choose(profile, order.body.backend)
         except (ProfileError, LinkError) as error:  # the world that is open is as sound as before
             raise RequestError(str(error)) from error
         self._log.say("backend", BANNERS[chosen], backend=chosen, asked=order.body.backend, before=self._backend)
-        if chosen != self._backend:
-            asked, began_with = order.body.backend, self.settings.backend
+        asked, began_with, before = order.body.backend, self.settings.backend, self._backend
+        if (chosen, asked) != (before, self._backend_asked):  # also to stay in the world that `auto` chose
             self._backend, self._backend_asked = chosen, asked
             self._memory.keep(
                 profile=str(profile.source_path),
@@ -244,15 +245,20 @@ class StageLoop(StageWatch):
                 backend_asked=asked,
                 swapped_from="" if asked == began_with else began_with,  # back to how it was started: no swap any more
             )
+        if chosen != before:
             self._open_anew()
         self._finish(order, BANNERS[chosen])
 
     def _do_reread(self, order: Order) -> None:
-        if self._state not in (State.OFF, State.IDLE):
-            raise RequestError(f"the profile is read again without power only; the state is {self._state}: stop first")
+        self._refuse_unless_free("the profile is read again")
         try:
-            load_profile(self._profile_asked)
+            self._read_again()
         except ProfileError as error:
             raise RequestError(f"kept as it was: {error}") from error
-        self._reread()
         self._finish(order, "the profile was read again")
+
+    def _refuse_unless_free(self, what: str) -> None:
+        """Refuse what lets go of the world while the stage has power, or while a fault of it stands."""
+        if not self._may_open_another:
+            first = "acknowledge that first" if self._state is State.FAULT else "stop first"
+            raise RequestError(f"{what} without power only; the state is {self._state}: {first}")

@@ -60,7 +60,7 @@ class StageState:
         self._recording = Recording(settings.runs_root, log)
         self._began_s = time.monotonic()
         self._profile_asked, self._backend_asked = settings.profile, settings.backend
-        self._profile: Profile | None = None
+        self._profile: Profile | None = None  # as it was read last; the next opening reads it where there is none
         self._backend = ""  # as `auto` was resolved, once
         self._stage: Supervisor | None = None
         self._state, self._since = State.OFF, now_text()

@@ -41,7 +41,7 @@ class StageWorld(StageState):
         """Try to open the stage; what is missing is waited for, what is wrong is a fault."""
         self._retry_at_s = time.monotonic() + _RETRY_S
         try:
-            profile = self._profile = load_profile(self._profile_asked)
+            profile = self._profile_as_read()
             if not self._backend:
                 self._backend, self._backend_asked, because = self._world_to_begin_with(profile)
                 facts = {"backend": self._backend, "asked": self._backend_asked, "because": because}
@@ -113,6 +113,15 @@ class StageWorld(StageState):
         )
         self._enter(Event.CONNECTED, stage.backend.description)
 
+    def _profile_as_read(self) -> Profile:
+        """Return the profile; from its file only where there is none yet, or it was wrong. Errors: ProfileError.
+
+        Read at every opening, a file that somebody is half through editing would be the stage's after a pulled cable.
+        """
+        if self._profile is None:
+            self._profile = load_profile(self._profile_asked)
+        return self._profile
+
     def _world_to_begin_with(self, profile: Profile) -> tuple[str, str, str]:
         """Return the world, what was asked for, and by whom: a client before the restart, else the service's start.
 
@@ -162,19 +171,36 @@ class StageWorld(StageState):
             self._enter(Event.LET_GO)
 
     def _reread(self) -> None:
-        """Read the profile again, and open the stage anew with it; a wrong one changes nothing."""
+        """Heed a signal: have the profile read again; a wrong one changes nothing."""
         self._rereading = False
         try:
-            load_profile(self._profile_asked)
+            self._read_again()
         except ProfileError as error:
             self._log.say("profile", f"kept as it was: {error}")
-            return
+
+    def _read_again(self) -> None:
+        """Read the profile again, and open the stage anew with it. Errors: ProfileError, and nothing is changed."""
+        self._profile = load_profile(self._profile_asked)
         self._log.say("profile", "read again", profile=self._profile_asked)
         self._open_anew()
 
+    @property
+    def _may_open_another(self) -> bool:
+        """Whether the world may be changed: no power, and no stage whose fault somebody must look at first.
+
+        A world that was opened into a fault is none: it can be left, and the acknowledgement opens another.
+        """
+        return self._state in (State.OFF, State.IDLE) or (self._state is State.FAULT and self._stage is None)
+
     def _open_anew(self) -> None:
-        """Let go of the world; the loop opens one at its next step, and says until then what it waits for."""
+        """Let go of the world; the loop opens one at its next step, and says until then what it waits for.
+
+        Where a fault stands, its acknowledgement comes before that.
+        """
         self._close_stage()
+        if self._state is State.FAULT:
+            self._wait_for("an acknowledgement of the fault")
+            return
         self._retry_at_s = 0.0
         self._wait_for(_OPENING)
 

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sim_backend.faults import Fault
 from sim_backend.machine import load_machine
 from stagectl import cli
 from stagectl import stage as stages
-from stagectl.backend import BatchBackend
+from stagectl.backend import RIG_VENDOR_ID, BatchBackend
 from stagectl.client import Client
 from stagectl.profile import PROFILES_FOLDER, Wear
 from stagectl.record import read_manifest, read_run
@@ -133,6 +134,104 @@ def test_a_command_that_comes_before_the_profile_is_read_again_hears_what_it_wai
     assert (bench.status.state, bench.status.waiting_for) == ("off", "opening the stage")
     bench.until(lambda: bench.desk.command(key).state == "failed")
     assert "the stage is not connected; waiting for: opening the stage" in bench.desk.command(key).text
+    bench.until(lambda: bench.status.state == "idle")
+    end(bench)
+
+
+def said_of_profile(bench):
+    """What the log has of reading the profile again."""
+    return [entry.text for entry in bench.log.last(200) if entry.event == "profile"]
+
+
+def loses_its_port(bench):
+    """Have the interferometer unplugged for a moment; the stage that it is opened anew from is returned."""
+    stage = bench.loop._stage
+    bench.inject(Fault("unplug", duration_s=0.2))
+    bench.until(lambda: bench.status.state == "fault")
+    assert bench.status.fault.kind == "LINK_LOST"
+    return stage
+
+
+def acknowledges(bench):
+    """Acknowledge the newest fault."""
+    if bench.desk.lease_left_s() == 0.0:
+        bench.take()
+    done = bench.do("acknowledge", messages.Acknowledge(number=bench.status.fault.number))
+    assert done.state == "done", done.text
+
+
+@pytest.mark.parametrize("left", ["half edited", "nonsense"])
+def test_a_file_that_nobody_said_to_read_again_is_not_read_after_a_fault(tmp_path, mine, left):
+    bench = connected(tmp_path, mine)
+    sound = mine.read_text()
+    mine.write_text(
+        changed(mine, {"macro.velocity_limit_m_per_s": EDITED_M_PER_S}) if left != "nonsense" else "name = 3"
+    )
+    stage = loses_its_port(bench)
+    acknowledges(bench)
+    bench.until(lambda: bench.loop._stage not in (stage, None) and bench.status.state == "idle")
+    bench.loop.step()
+    assert bench.status.limits.velocity_m_per_s == LIMIT_M_PER_S
+    assert said_of_profile(bench) == []
+
+    mine.write_text(sound)
+    mine.write_text(changed(mine, {"macro.velocity_limit_m_per_s": EDITED_M_PER_S}))
+    again = bench.do("reread", messages.Home())
+    assert again.text == "the profile was read again"
+    bench.until(lambda: bench.status.state == "idle")
+    bench.loop.step()
+    assert bench.status.limits.velocity_m_per_s == EDITED_M_PER_S
+    loses_its_port(bench)
+    acknowledges(bench)
+    bench.until(lambda: bench.status.state == "idle")
+    bench.loop.step()
+    assert bench.status.limits.velocity_m_per_s == EDITED_M_PER_S
+    assert said_of_profile(bench) == ["read again"]
+    end(bench)
+
+
+def test_a_profile_read_again_while_a_fault_stands_is_the_one_that_is_opened(tmp_path, mine):
+    bench = connected(tmp_path, mine)
+    loses_its_port(bench)
+    mine.write_text(changed(mine, {"macro.velocity_limit_m_per_s": EDITED_M_PER_S}))
+    bench.loop.reread()
+    acknowledges(bench)
+    bench.until(lambda: bench.status.state == "idle")
+    bench.loop.step()
+    assert bench.status.limits.velocity_m_per_s == EDITED_M_PER_S
+    assert said_of_profile(bench) == ["read again"]
+    end(bench)
+
+
+def test_a_profile_that_is_wrong_at_the_start_is_waited_for(tmp_path, mine):
+    sound = mine.read_text()
+    mine.write_text("name = 3\n")
+    bench = begun(tmp_path, mine)
+    bench.loop.step()
+    assert (bench.status.state, bench.status.fault) == ("off", None)
+    assert f"{mine}" in bench.status.waiting_for
+    assert "name" in bench.status.waiting_for
+    mine.write_text(sound)
+    bench.loop._retry_at_s = 0.0
+    bench.until(lambda: bench.status.state == "idle")
+    end(bench)
+
+
+def test_a_profile_that_opens_no_stage_is_corrected_and_then_acknowledged(tmp_path, mine):
+    sound = mine.read_text()
+    mine.write_text(changed(mine, {"name": "nobody-knows"}))  # the rig has no machine of that name
+    bench = begun(tmp_path, mine)
+    bench.until(lambda: bench.status.state == "fault")
+    assert (bench.status.fault.kind, bench.status.profile) == ("ProfileError", "nobody-knows")
+    assert bench.status.fault.remedy == "correct the profile, then acknowledge"
+    mine.write_text(sound)
+    acknowledges(bench)
+    bench.until(lambda: bench.status.state == "idle")
+    bench.loop.step()
+    assert bench.status.profile == "single-axis"
+    mine.write_text("name = 3\n")  # read once it was wrong, and not for ever after
+    loses_its_port(bench)
+    acknowledges(bench)
     bench.until(lambda: bench.status.state == "idle")
     end(bench)
 
@@ -311,6 +410,121 @@ def test_a_service_that_was_swapped_back_chooses_at_its_next_start_as_if_it_neve
     bench = begun(tmp_path, mine, "auto")
     bench.loop.step()
     assert bench.status.banner == "HARDWARE: what moves here is real"
+    end(bench)
+
+
+def test_a_swap_opens_the_profile_that_it_was_chosen_with(tmp_path, rig_here, mine):
+    bench = connected(tmp_path, mine)
+    mine.write_text("name = 3\n")
+    swap(bench, "rig")
+    bench.until(lambda: bench.status.state == "idle")
+    bench.loop.step()
+    assert bench.status.banner == RIG
+    end(bench)
+
+
+class OtherMachine(BatchBackend):
+    """Drives in virtual time that are not those of the profile: 0x1018 says so, as of a machine's own."""
+
+    name = "hardware"
+    vendor_id = None
+
+
+def refused_by_its_drives(folder, profile, monkeypatch, plugs):
+    """A service that was started with the rig and swapped to hardware, whose drives are others: not opened."""
+    monkeypatch.setattr(stages, "HardwareBackend", lambda profile: OtherMachine(load_machine("single-axis")))
+    for plug in plugs:
+        plug.touch()
+    bench = connected(folder, profile, "rig")
+    swap(bench, "hardware")
+    bench.until(lambda: bench.status.state == "fault")
+    assert (bench.status.fault.kind, bench.loop._stage) == ("DriveError", None)
+    assert "vendor id" in bench.status.fault.values
+    return bench
+
+
+@pytest.mark.parametrize("restarted", ["never", "before the swap", "behind the swap"])
+def test_a_world_that_can_not_be_opened_can_be_left(tmp_path, rig_here, mine, plugs, monkeypatch, restarted):
+    bench = refused_by_its_drives(tmp_path, mine, monkeypatch, plugs)
+    fault = bench.status.fault
+    if restarted == "before the swap":
+        end(bench)
+        bench = begun(tmp_path, mine, "rig")
+        bench.take()
+    swapped = bench.do("backend", messages.SwapBackend(backend="rig"))
+    assert (swapped.state, swapped.text) == ("done", RIG)
+    for _ in range(3):
+        bench.loop.step()
+    assert (bench.status.state, bench.status.fault, bench.loop._stage) == ("fault", fault, None)
+    assert (bench.status.banner, bench.status.waiting_for) == (RIG, "an acknowledgement of the fault")
+    kept = recall(tmp_path / "state")[0]
+    assert (kept.backend, kept.swapped_from, kept.fault) == ("rig", "", fault)
+    if restarted == "behind the swap":
+        end(bench)
+        bench = begun(tmp_path, mine, "rig")
+        assert bench.status.fault == fault
+    acknowledges(bench)
+    assert (bench.status.state, bench.status.waiting_for) == ("off", "opening the stage")
+    bench.until(lambda: bench.status.state in ("idle", "fault"))
+    bench.loop.step()
+    assert (bench.status.state, bench.status.fault, bench.status.banner) == ("idle", None, RIG)
+    end(bench)
+
+
+def test_a_profile_that_names_other_drives_is_corrected_and_read_again_before_it_is_acknowledged(
+    tmp_path, rig_here, mine, plugs, monkeypatch
+):
+    bench = refused_by_its_drives(tmp_path, mine, monkeypatch, plugs)
+    fault = bench.status.fault
+    mine.write_text(changed(mine, {"macro.identity.vendor_id": RIG_VENDOR_ID}))
+    assert bench.do("reread", messages.Home()).state == "done"
+    assert (bench.status.state, bench.status.fault) == ("fault", fault)
+    acknowledges(bench)
+    bench.until(lambda: bench.status.state in ("idle", "fault"))
+    bench.loop.step()
+    assert (bench.status.state, bench.status.banner) == ("idle", "HARDWARE: what moves here is real")
+    end(bench)
+
+
+def test_the_world_of_a_stage_that_stopped_is_not_changed_before_its_fault_is_acknowledged(tmp_path, rig_here):
+    bench = connected(tmp_path)
+    stage = loses_its_port(bench)
+    for name, body in (("backend", messages.SwapBackend(backend="rig")), ("reread", messages.Home())):
+        refused = bench.do(name, body)
+        assert refused.error.kind == "RequestError"
+        assert "the state is fault: acknowledge that first" in refused.text
+    assert (bench.status.state, bench.status.backend) == ("fault", "batch")
+    assert bench.loop._stage is stage
+    end(bench)
+
+
+def test_a_world_that_auto_chose_and_a_client_asked_for_stays_after_a_restart(tmp_path, rig_here, mine, plugs):
+    bench = connected(tmp_path, mine, "auto")
+    assert bench.status.banner == RIG
+    stage, bench.loop._homed = bench.loop._stage, True
+    assert bench.do("backend", messages.SwapBackend(backend="rig")).text == RIG
+    bench.loop.step()
+    assert (bench.status.state, bench.status.homed) == ("idle", True)
+    assert bench.loop._stage is stage  # there was nothing to open anew
+    end(bench)
+    for plug in plugs:
+        plug.touch()
+    bench = connected(tmp_path, mine, "auto")
+    assert bench.status.banner == RIG
+    (said,) = [entry for entry in bench.log.last(200) if entry.event == "backend"]
+    assert said.fields == {"backend": "rig", "asked": "rig", "because": "a client before the restart"}
+
+    for plug in plugs:
+        plug.unlink()
+    stage = bench.loop._stage
+    assert bench.do("backend", messages.SwapBackend(backend="auto")).text == RIG
+    assert bench.loop._stage is stage
+    end(bench)
+    for plug in plugs:
+        plug.touch()
+    bench = begun(tmp_path, mine, "auto")
+    bench.loop.step()
+    assert bench.status.banner == "HARDWARE: what moves here is real"  # asked for no longer
     end(bench)
 
 
