@@ -155,7 +155,7 @@ def serial_unplugged() -> None:
     """The interferometer's adapter is pulled under a moving stage, and plugged in again."""
     serials = Path("/sys/bus/usb/devices").glob("*/serial")
     adapter = next(path.parent for path in serials if path.read_text().strip() in PORT)
-    with homing():
+    with moving():
         began_s = time.monotonic()
         (adapter / "authorized").write_text("0")
         stops("unplugged", began_s)
@@ -171,7 +171,7 @@ def serial_unplugged() -> None:
 
 def servo_killed() -> None:
     """The servo is killed under a moving stage."""
-    with homing():
+    with moving():
         began_s = time.monotonic()
         os.kill(servo_pid(), signal.SIGKILL)
         stops("servo killed", began_s)
