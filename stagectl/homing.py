@@ -1,6 +1,7 @@
 """Zeros and joint of a stage: homing, touching both edges, identifying the backlash, believing what was found."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -56,7 +57,7 @@ class Homing(StreamMotion):
             estimate = outcome.backlash
             if not outcome.finished or estimate is None:
                 return self._outcome("home", outcome.stop, first_row)
-            self.take_backlash(estimate)
+            estimate = self.take_backlash(estimate)
         self._event("homing", number=self._homing_id, macro_zero_counts=macro_zero, end_zero_counts=end_zero)
         return self._outcome("home", Stop.FINISHED, first_row, estimate)
 
@@ -202,10 +203,10 @@ class Homing(StreamMotion):
         if self._heartbeats.missing:
             raise LinkError(f"homing: {stop_sentence(Stop.HEARTBEAT_LOST, self._heartbeats.detail(self._node_ids))}")
 
-    def take_backlash(self, estimate: BacklashEstimate) -> None:
+    def take_backlash(self, estimate: BacklashEstimate) -> BacklashEstimate:
         """Believe an identified backlash; the end's zero moves so that the gap's centre is where the profile has it.
 
-        RequestError where it is none.
+        Returns the estimate in the zeros that hold from now on. RequestError where it is none.
         """
         _refuse_no_joint(estimate)
         status = self.status()
@@ -215,18 +216,24 @@ class Homing(StreamMotion):
         # x_b = macro - end must grow by (centre - identified centre): the end's positions shrink by it
         end_zero = (before_m + (centre_m - estimate.centre_m)) / end_scale
         macro_zero = float(status["macro_counts"]) - float(status["macro_position_m"]) / macro_scale
-        self._belief["left_m"] = 0.5 * estimate.width_m - centre_m
-        self._belief["right_m"] = 0.5 * estimate.width_m + centre_m
-        self._belief["left_stiffness_n_per_m"] = estimate.left_stiffness_n_per_m
-        self._belief["right_stiffness_n_per_m"] = estimate.right_stiffness_n_per_m
+        half_m = 0.5 * estimate.width_m
+        estimate = replace(estimate, left_m=half_m - centre_m, right_m=half_m + centre_m)
+        for name in _JOINT:
+            self._belief[name] = getattr(estimate, name)
         self._publish_update(macro_zero, end_zero)
+        return estimate
 
     def replace_backlash(self, estimate: BacklashEstimate) -> None:
         """Believe what wear has made of the joint; zeros stay, the stage does not move, the estimator begins anew.
 
-        A recorded event. RequestError where it is none, and while a motion is under way.
+        A recorded event. RequestError where it is none, an edge is not above 0, or a motion is under way.
         """
         _refuse_no_joint(estimate)
+        if not (estimate.left_m > 0.0 and estimate.right_m > 0.0):
+            raise RequestError(
+                f"backlash from {-estimate.left_m:g} to {estimate.right_m:g} m: zero must be between its edges; the "
+                "end's zero has moved: look at the end's interferometer, then home"
+            )
         status = self.status()
         if status["phase"] != Phase.TRACKING or status["segment_left_rows"] > 0:
             raise RequestError("a backlash is replaced between moves only; wait until the stage holds")

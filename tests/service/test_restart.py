@@ -293,13 +293,22 @@ def test_the_joint_survives_with_its_date_and_run_and_homing_does_not(tmp_path):
     homed = bench.do("home", messages.Home())
     assert homed.stop == "FINISHED"
     believed = bench.loop._stage.believed_backlash()
-    assert abs(homed.backlash.left_m - believed["left_m"]) > 1e-6  # its edges are from zeros that it has moved since
+    # Believing it moved the end's zero: what is published of it has edges and middle in the zeros that hold since. This
+    # asserted the opposite, as long as edges were published that lay nowhere any more.
+    assert {name: getattr(homed.backlash, name) for name in believed} == believed
+    plant, seen = bench.loop._stage.backend.rig.plant_state(), bench.loop._stage.status()
+    measured_m = float(seen["macro_position_m"]) - float(seen["end_position_m"])
+    off_m = measured_m - (plant["macro_position_m"] - plant["end_position_m"])
+    true = load_machine("oled-printer").backlash
+    assert homed.backlash.left_m == pytest.approx(true.left_m - off_m, abs=0.5e-6)
+    assert homed.backlash.right_m == pytest.approx(true.right_m + off_m, abs=0.5e-6)
     for _ in range(5):
         bench.loop.step()
     assert bench.loop._stage.believed_backlash() == believed
     (run,) = bench.settings.runs_root.glob("*-service-home")
     bench.loop.step()
     assert (bench.status.homed, bench.status.backlash) == (True, homed.backlash)
+    assert {name: getattr(bench.status.wear, name) for name in believed} == believed
     bench.now_s += 100.0
     bench.until(lambda: bench.status.state == "fault")
     bench.take()
