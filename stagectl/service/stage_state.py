@@ -107,10 +107,15 @@ class StageState:
             self._fault = kept.fault
             self._enter(Event.TRIPPED, "not acknowledged before the service ended")
 
+    @property
+    def _in_production(self) -> bool:
+        """Whether what the joint shows is of production: not of a sweep over its edges, nor in zeros not yet laid."""
+        return self._homed and self._state in (State.ARMED, State.MOVING)
+
     def _look_at_joint(self) -> None:
         """Follow the wear of a joint that works."""
         stage, wear = self._stage, self._wear
-        if stage is None or wear is None or self._opening:
+        if stage is None or wear is None or self._opening or not self._in_production:
             return
         status = stage.status()
         if status["phase"] == Phase.TRACKING:

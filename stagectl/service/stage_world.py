@@ -218,7 +218,7 @@ class StageWorld(StageState):
         self._scope.add(rows)
         self._figures.add(rows)
         self._recording.observe(rows)
-        if self._wear is not None:
+        if self._wear is not None and self._in_production:
             self._wear.observe(rows)
 
     def _progress(self, what: str, share: float) -> None:
