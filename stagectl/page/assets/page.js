@@ -67,7 +67,8 @@ function showRail(id, low, high, value, others = {}) {
 }
 
 function showPositions(status) {
-  const { positions, limits, backlash } = status;
+  const { positions, limits } = status;
+  const backlash = status.wear ?? status.backlash;
   write('end', number(positions.end_position_m, 1e3, 4));
   write('setpoint', number(positions.setpoint_position_m, 1e3, 4));
   write('macro', number(positions.macro_position_m, 1e3, 4));
@@ -178,7 +179,7 @@ function take(message) {
   heardAt = performance.now();
   showLost('');
   const { status, samples } = message;
-  scope.setStage(status.limits?.has_micro ?? true, status.backlash);
+  scope.setStage(status.limits?.has_micro ?? true, status.wear ?? status.backlash);
   scope.add(samples.rows);
   const newest = scope.rows.at(-1);
   if (newest) {
