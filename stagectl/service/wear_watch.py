@@ -42,7 +42,8 @@ class WearWatch:
         self._least_n = max(_LEAST_FORCE_N, _TOUCH_SHARE * joint.touch_force_n)
         self._tracker = WearTracker(
             WearLimits(
-                width_m=joint.left_m + joint.right_m,
+                left_m=joint.left_m,
+                right_m=joint.right_m,
                 stiffness_n_per_m=(joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m),
                 width_change_limit_m=wear.width_change_limit_m,
                 stiffness_change_limit_ratio=wear.stiffness_change_limit_ratio,
@@ -89,7 +90,7 @@ class WearWatch:
     def found(self, estimate: BacklashEstimate | None, source: str, is_believed: bool = False) -> None:
         """Take what an identification, a homing or a probe found.
 
-        `is_believed`: the compensation has it, as after a homing, whose edges are from zeros that it has moved since.
+        `is_believed`: the compensation has it already, as after a homing.
         """
         if self._tracker is not None and estimate is not None:
             if self._tracker.look(estimate, self._now_s(), source):
@@ -131,9 +132,7 @@ class WearWatch:
         every_s, now_s = self._profile.wear.probe_every_s, self._now_s()
         if self._tracker is None or every_s is None:
             return False
-        newest = self._tracker.newest
-        known_s = max(self._probed_s, -math.inf if newest is None else newest.t_s)
-        return now_s - known_s >= every_s
+        return now_s - max(self._probed_s, self._tracker.known_s) >= every_s
 
     def probe_begun(self) -> None:
         """A probe begins; whatever becomes of it, the next is not due before `wear.probe_every_s`."""

@@ -246,11 +246,22 @@ def test_the_compensation_itself_refuses_what_is_no_joint(armed, change):
     assert len(armed.replacements()) == events
 
 
+@pytest.mark.parametrize("left_m", [0.0, -1e-6])
+def test_the_compensation_itself_refuses_an_edge_at_or_beyond_zero(armed, left_m):
+    before, events = believes(armed), len(armed.replacements())
+    with pytest.raises(RequestError, match="zero must be between its edges; the end's zero has moved: look at"):
+        armed.stage.replace_backlash(joint(armed.profile, left_m=left_m))
+    armed.steps()
+    assert believes(armed) == before
+    assert len(armed.replacements()) == events
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         ({"left_m": BEYOND_M}, "the limit is 50 um"),
         ({"right_m": -BEYOND_M}, "the limit is 50 um"),
+        ({"left_m": 26e-6, "right_m": -26e-6}, "look at the end's interferometer, then home"),
         ({"left_stiffness_n_per_m": 5e3}, "the left contact has"),
         ({"right_stiffness_n_per_m": -5e3}, "the right contact has"),
     ],
@@ -433,3 +444,34 @@ def test_what_ends_the_service_s_own_probe_ends_it_at_once_and_says_nothing_of_t
     assert armed.do("arm", messages.Arm()).stop == "FINISHED"
     armed.steps()
     assert armed.probes() == [key]
+
+
+# ---- what is no production -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "body"), [("home", messages.Home()), ("identify", messages.Identify()), ("probe", messages.Probe())]
+)
+def test_a_sweep_that_is_stopped_near_its_end_says_nothing_of_production(armed, name, body):
+    """Looks into homing's, in zeros not yet laid, were kept as production's in the place of what was identified."""
+    identified = armed.loop._memory.joint("batch", armed.profile.name)
+    armed.loop._wear = WearWatch(armed.profile, armed.log, lambda: armed.stage.link.now_t_ns() * 1e-9)
+    progress, near_the_end = armed.loop._progress, []
+
+    def then_stop(what, share):
+        if share > 0.95 and what in ("touching both edges", "identifying the backlash") and not near_the_end:
+            near_the_end.append(armed.stage.backlash(armed.stage.status()).identifiable)
+            armed.desk.ask_to_stop("seen enough")
+        progress(what, share)
+
+    armed.stage._progress = then_stop
+    done = armed.do(name, body)
+    armed.stage._progress = progress
+    assert (done.stop, near_the_end) == ("OPERATOR", [True])
+    armed.until(lambda: armed.status.state == "idle" and not armed.desk.stop_asked)
+    armed.steps()
+    assert armed.status.wear is None
+    assert armed.loop._memory.joint("batch", armed.profile.name) == identified
+    if name == "home":
+        assert not armed.status.homed
+        home_by_truth(armed.stage, armed.rig.plant_state())

@@ -166,6 +166,9 @@ def test_a_probe_is_due_where_it_is_permitted_and_nothing_else_told_of_the_joint
     assert not one.watch.probe_due()
     one.now_s += 61.0
     assert one.watch.probe_due()
+    one.work(joint(oled_profile, left_sd_m=2e-7), 3.0, -3.0)  # less sure than what stands, and as sure as is trusted
+    assert not one.watch.probe_due()
+    assert one.watch.message().age_s == pytest.approx(62.0)
 
 
 def test_a_stage_that_holds_takes_a_new_belief_without_moving_and_replays(oled_profile, oled_machine, tmp_path):
