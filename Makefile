@@ -50,11 +50,12 @@ browser-test: setup
 guest-test: setup
 	PYTHON=$(CURDIR)/$(BIN)/python tests/guest/run.sh
 
+# What a full run measured (docs/figures-service.md, docs/gap-results.json) is kept: these are the short runs.
 bench: setup
 	$(BIN)/python -m bench main_job --markdown docs/figures.md
 	$(BIN)/python -m bench gap --markdown docs/figures-gap.md
 	$(BIN)/python -m bench paper --markdown docs/figures-paper.md
-	$(BIN)/python -m bench service --markdown docs/figures-service.md
+	$(BIN)/python -m bench service --markdown docs/figures-service-part.md
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -58,11 +58,12 @@ def table(figures: Iterable[Figure]) -> str:
     return "\n".join(lines)
 
 
-def _page(name: str, about: str, figures: list[Figure], load: str, took_s: float) -> str:
+def _page(name: str, about: str, figures: list[Figure], load: str, took_s: float, full: bool) -> str:
     day = time.strftime("%Y-%m-%d")
+    by = f"python -m bench {name} --full" if full else "make bench"
     return (
         f"# Figures: {name}\n\n"
-        f"Written by `make bench` on {day}; {took_s:.0f} s on {os.cpu_count()} CPUs. {load}\n"
+        f"Written by `{by}` on {day}; {took_s:.0f} s on {os.cpu_count()} CPUs. {load}\n"
         f"{about}\n\n"
         f"{table(figures)}\n"
     )
@@ -102,7 +103,9 @@ def main(argv: list[str] | None = None) -> int:
         _write(f"{table(figures)}\n{load}", arguments.out)
     if arguments.markdown is not None:
         arguments.markdown.parent.mkdir(parents=True, exist_ok=True)
-        arguments.markdown.write_text(_page(arguments.name, module.ABOUT, figures, load, time.monotonic() - begin_s))
+        took_s = time.monotonic() - begin_s
+        page = _page(arguments.name, module.ABOUT, figures, load, took_s, arguments.full)
+        arguments.markdown.write_text(page)
     return 1 if any(figure.holds is False for figure in figures) else 0
 
 

@@ -1,6 +1,8 @@
 """The deterministic rows of `bench main_job` in short form: the bars are the bench's own."""
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -130,6 +132,20 @@ def test_the_exit_code_says_whether_a_bar_was_missed(holds, code, monkeypatch, t
     assert (tmp_path / "out").read_text().startswith(line)
     assert "| a figure | 1 nm" in page.read_text()
     assert "Load average" in page.read_text()
+
+
+def test_make_bench_overwrites_only_what_it_wrote(tmp_path, monkeypatch):
+    """The result of a full run takes a day, and is committed."""
+    root = Path(__file__).resolve().parents[1]
+    target = re.findall(r"-m bench (.*)", (root / "Makefile").read_text())
+    assert len(target) == 4
+    for command in target:
+        page = root / re.findall(r"--markdown (\S+)", command)[0]
+        assert "--full" not in command
+        assert not page.exists() or "\nWritten by `make bench` on " in page.read_text(), page
+    monkeypatch.setattr(main_job, "figures", lambda full, say: iter(()))
+    main(["main_job", "--full", "--markdown", str(tmp_path / "full.md")])
+    assert "\nWritten by `python -m bench main_job --full` on " in (tmp_path / "full.md").read_text()
 
 
 def test_a_replay_without_motion_does_not_hold():
