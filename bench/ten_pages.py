@@ -144,13 +144,17 @@ def figures_of(found: Sequence[Windows]) -> Iterator[Figure]:
     cycles_count = sum(one.cycles_count for windows in found for one in windows)
     for bar, kind in ((INCREASE, "ten"), (INCREASE_LOAD, "load")):
         apart = [getattr(one, kind).missed_per_min - one.none.missed_per_min for one in found]
-        upper_per_min = -lower_limit([-one for one in apart])
+        lower_per_min, upper_per_min = lower_limit(apart), -lower_limit([-one for one in apart])
+        # With this spread, a greater increase would have had its lower end above 0.
+        told_per_min = median_increase(apart) - lower_per_min
         remark = (
             f"{len(found)} pairs of windows of {found[0].none.duration_s:.0f} s; "
-            f"median increase {median_increase(apart):+.2f}, upper end {upper_per_min:+.2f}; "
+            f"median increase {median_increase(apart):+.2f}, "
+            f"95 % each way {lower_per_min:+.2f} .. {upper_per_min:+.2f}; "
+            f"an increase of up to {told_per_min:.2f} could not have been told; "
             f"{cycles_count} cycles; power on in {len(found)} of {measured_count} pairs, the others left out"
         )
-        yield judged(bar, lower_limit(apart), reason=remark)
+        yield judged(bar, lower_per_min, reason=remark)
     for bar, kind in ((WITHOUT_PAGES, "none"), (WITH_PAGES, "ten"), (WITH_LOAD, "load")):
         rates = [getattr(one, kind).missed_per_min for one in found]
         reason = f"mean; windows from {min(rates):.1f} to {max(rates):.1f}"

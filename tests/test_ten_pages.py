@@ -47,6 +47,20 @@ def test_one_more_miss_in_each_window_is_an_increase_and_a_burst_in_one_is_none(
     assert judged_windows(1, bursts=(3,))[INCREASE.figure].holds is False  # nor does it hide one
 
 
+def test_a_verdict_says_what_it_could_not_have_told():
+    """Eight pairs apart by -30 to 40 a minute: 95 % from -15 on; 20 more in each pair, and the lower end is above 0."""
+    apart = [-30, -20, -10, 0, 10, 20, 30, 40]
+    one = Window(100, 60_000, 60.0, True)
+    for added, holds in ((0, True), (15, True), (16, False)):
+        found = [Windows(one, one._replace(missed_count=100 + k + added), one) for k in apart]
+        figure = next(figures_of(found))
+        assert (figure.holds, figure.value) == (holds, -15.0 + added)
+        assert (
+            f"{5 + added:+.2f}, 95 % each way {-15 + added:+.2f} .. {25 + added:+.2f}; an increase of up to 20.00 "
+            in (figure.reason)
+        )
+
+
 def test_a_load_without_a_client_has_a_row_of_its_own_and_excuses_nothing():
     figures = judged_windows(5, load_increase=5)
     assert figures[INCREASE.figure].holds is False
