@@ -75,7 +75,7 @@ class Mutant:
 
 
 def mutants(source: str) -> list[Mutant]:
-    """Return every mutant of a module's functions and constants; texts and annotations stay as they are."""
+    """Return every mutant of a module's functions, constants and defaults; texts and annotations stay as they are."""
     tree = ast.parse(source)
     found: list[Mutant] = []
     counted: dict[str, int] = {}
@@ -120,8 +120,15 @@ def _scopes(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
             for inner in node.body:
                 if isinstance(inner, ast.FunctionDef):
                     yield f"{node.name}.{inner.name}", ast.Module(inner.body, [])
+                elif _is_default(inner):
+                    yield node.name, inner
         elif isinstance(node, ast.Assign) and not isinstance(node.value, ast.Call):
             yield "module", node
+
+
+def _is_default(node: ast.stmt) -> bool:
+    """Tell whether a line of a class gives a field its default."""
+    return isinstance(node, ast.AnnAssign) and node.value is not None and not isinstance(node.value, ast.Call)
 
 
 def _changes(node: ast.AST, parent: ast.AST) -> Iterator[tuple[ast.AST, str]]:
@@ -249,7 +256,10 @@ def trial(module: str, changed: list[Mutant], tests: list[str], timeout_s: float
 
 
 def _collect(name: str, changed: list[Mutant], tests: list[str], timeout_s: float, out: TextIO) -> None:
-    """Import the module uncompiled and collect its tests; `_Session` does the rest."""
+    """Import the module, uncompiled where it has compiled code, and collect its tests; `_Session` does the rest.
+
+    One without is taken as it is: what imports it (backends hold the servo's class) is to run its mutants too.
+    """
     import pytest
 
     from stagectl import compiled as compiler
@@ -257,11 +267,13 @@ def _collect(name: str, changed: list[Mutant], tests: list[str], timeout_s: floa
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
     os.dup2(null, 2)
-    compiler.compiled = uncompiled  # type: ignore[assignment]
-    sys.modules.pop(name, None)
     module = importlib.import_module(name)
-    package, _, last = name.rpartition(".")
-    setattr(sys.modules[package], last, module)
+    if "compiled" in vars(module):
+        compiler.compiled = uncompiled  # type: ignore[assignment]
+        del sys.modules[name]
+        module = importlib.import_module(name)
+        package, _, last = name.rpartition(".")
+        setattr(sys.modules[package], last, module)
     for path in tests:
         sys.modules.pop(path.removesuffix(".py").replace("/", "."), None)
     known = "ignore::pytest.PytestAssertRewriteWarning"  # libraries that the first process has imported
@@ -336,7 +348,7 @@ class _Session:
 
 
 def put(module: types.ModuleType, tree: ast.Module, function: str) -> None:
-    """Give a module's function the code that a tree has for it, or its constants their values, in place.
+    """Give a module's function the code that a tree has for it, its constants or a class's defaults their values.
 
     In place, because tests hold functions and classes that they imported.
     """
@@ -354,5 +366,9 @@ def put(module: types.ModuleType, tree: ast.Module, function: str) -> None:
     new: Any = types.SimpleNamespace(**{name: made[name] for name in made if name.isidentifier()})
     for name in function.split("."):
         old, new = getattr(old, name), getattr(new, name)
+    if isinstance(old, type):  # a dataclass: its defaults are those of the `__init__` that was made for it
+        old, new = old.__init__, new.__init__
+    if isinstance(old, property):
+        old, new = old.fget, new.fget
     old, new = inspect.unwrap(old), inspect.unwrap(new)
     old.__code__, old.__defaults__, old.__kwdefaults__ = new.__code__, new.__defaults__, new.__kwdefaults__
