@@ -73,8 +73,9 @@ def as_entry(result: campaign.Result) -> dict:
         "skipped": result.reason,
         "took_s": result.took_s,
         "violations": [] if verdict is None else [list(one) for one in verdict.violations],
-        "begun_cycles": 0.0 if verdict is None else verdict.begun_cycles,
+        "begun_cycles": None if verdict is None else verdict.begun_cycles,
         "cycles_lost": 0 if verdict is None else verdict.cycles_lost,
+        "cycles_owed": 0 if verdict is None else verdict.cycles_owed,
         "drift_m": 0.0 if verdict is None else verdict.drift_m,
     }
 
@@ -83,14 +84,19 @@ def of_entries(entries: list[dict], seeds: list[int], count: Bar = COUNT_ONE) ->
     """Hold all runs together against each bar; `count`: that of how many there must be."""
     played = [entry for entry in entries if not entry["skipped"]]
     yield judged(count, len(played), seeds, _skipped(entries))
+    nothing = float("nan")  # measured in no run; never holds
     for name, bar in MISSED.items():
         missed = [entry for entry in played if any(bar_name == name for bar_name, _ in entry["violations"])]
-        value = sum(entry["cycles_lost"] for entry in played) if name == LOST else len(missed)
-        said = GENTLE if name == TRAVEL else ""
-        yield judged(bar, value, reason="; ".join(entry["line"] for entry in missed[:3]) or said)
-    yield judged(BEGUN, max((entry["begun_cycles"] for entry in played), default=0.0))
+        value, said, measured = float(len(missed)), GENTLE if name == TRAVEL else "", bool(played)
+        if name == LOST:
+            value, owed = (sum(entry[key] for entry in played) for key in ("cycles_lost", "cycles_owed"))
+            said, measured = f"of {owed} cycles in motion", owed > 0
+        said = "; ".join([said, *(entry["line"] for entry in missed[:3])]).removeprefix("; ")
+        yield judged(bar, value if measured else nothing, reason=said)
+    begun = [entry["begun_cycles"] for entry in played if entry["begun_cycles"] is not None]
+    yield judged(BEGUN, max(begun, default=nothing), reason=f"measured in {len(begun)} of {len(played)} runs")
     lame = [entry for entry in played if any(name == BACK for name, _ in entry["violations"])]
-    share = 100.0 * (1.0 - len(lame) / len(played)) if played else float("nan")
+    share = 100.0 * (1.0 - len(lame) / len(played)) if played else nothing
     yield judged(RECOVERED, share, reason="; ".join(entry["line"] for entry in lame[:3]))
     for kind in KINDS:
         of_kind = [entry for entry in played if entry["kind"] == kind]

@@ -35,6 +35,7 @@ _WATCHES = "the drive that misses 20 SYNCs is sooner than its heartbeat watch"
 UNREADABLE = Bar("runs unreadable after kill or power cut", "runs", 0.0)
 SERVO_GROWTH = Bar("soak: memory growth of the servo after warm-up", "bytes", soak.PAGE_BYTES)
 SUPERVISOR_GROWTH = Bar("soak: memory growth of the supervisor after warm-up", "MiB", 1.0)
+SOAK_MOTIONS = "soak: motions that came to their end"
 SOAKED = Bar("soak: cycles", "cycles")
 SOAK_MISSED = Bar("soak: missed cycles a minute", "cycles")
 
@@ -69,12 +70,13 @@ def figures(*, full: bool, say: Say, seeds: Sequence[int] | None = None) -> Iter
     said = [f"{kinds}; {phases}", *{entry["skipped"] for entry in played} - {""}]
     count = COUNT_ONE if seeds is not None else COUNT_FULL if full else COUNT
     yield judged(count, len(entries), wanted, "; skipped: ".join(said))
+    nothing = float("nan")  # of no run; never holds
     for name, bar in MISSED.items():
         missed = [entry["line"] for entry in entries if any(one == name for one, _ in entry["violations"])]
         said = f"{GENTLE}; t with what the host held servo or rig up, and 5 ms" if name == TRAVEL else ""
-        yield judged(bar, len(missed), reason="; ".join(missed[:3]) or said)
+        yield judged(bar, len(missed) if entries else nothing, reason="; ".join(missed[:3]) or said)
     lame = [entry["line"] for entry in entries if any(one == BACK for one, _ in entry["violations"])]
-    share = 100.0 * (1.0 - len(lame) / len(entries)) if entries else float("nan")
+    share = 100.0 * (1.0 - len(lame) / len(entries)) if entries else nothing
     yield judged(RECOVERED, share, reason="; ".join(lame[:3]))
 
 
@@ -105,10 +107,9 @@ def loss_figures(*, full: bool, say: Say) -> Iterator[Figure]:
                 counts.append(f"{strike.text}: {one.rows_count} rows of {one.syncs_count} SYNCs")
                 say(f"{bar.figure}: {counts[-1]}, {one.cycles_lost} lost")
             unreadable += [text for one in found for text in one.unreadable]
-            worst = max(one.cycles_lost for one in found)
-            yield judged(bar, worst, list(seeds[name]), "; ".join(counts[:3]))
+            yield lost_figure(bar, found, list(seeds[name]), "; ".join(counts[:3]))
         begun = ", ".join(f"{stop.begun_s * 1e3:.0f} ms" for stop in stops)
-        said = f"by the rig's log: {begun}; {_WATCHES}"
+        said = f"by the rig's log, in {len(stops)} of {len(strikes['servo'])} kills: {begun}; {_WATCHES}"
         nan = float("nan")
         yield judged(STOP_BEGUN, max((stop.begun_s for stop in stops), default=nan), list(seeds["servo"]), said)
         yield judged(STOP_ENDED, max((stop.rest_s for stop in stops), default=nan), list(seeds["servo"]))
@@ -125,17 +126,42 @@ def loss_figures(*, full: bool, say: Say) -> Iterator[Figure]:
             said = (
                 f"cycles lost in {len(cuts)} cuts: {lost}; {'; '.join(strike.text for strike in strikes['power'][:3])}"
             )
-            yield judged(LOST_POWER, max(lost) * CYCLE_S, list(seeds["power"]), said)
-    yield judged(UNREADABLE, len(unreadable), reason="; ".join(unreadable[:3]))
+            yield lost_figure(LOST_POWER, cuts, list(seeds["power"]), said, CYCLE_S)
+    struck = f"{sum(len(strikes[name]) for name in kills)} kills, {len(cuts)} power cuts"
+    yield judged(UNREADABLE, len(unreadable), reason="; ".join([struck, *unreadable[:3]]))
+
+
+def lost_figure(
+    bar: Bar, found: Sequence[losses.Loss], seeds: list[int], remark: str, unit_per_cycle: float = 1.0
+) -> Figure:
+    """Judge the worst of some strikes; missed where any of them owed no row, and so measured nothing."""
+    empty_count = sum(one.syncs_count == 0 for one in found)
+    if empty_count:
+        said = f"no SYNC of a stage with power in {empty_count} of {len(found)}: nothing measured there; {remark}"
+        return judged(bar, float("nan"), seeds, said)
+    return judged(bar, unit_per_cycle * max(one.cycles_lost for one in found), seeds, remark)
 
 
 def soak_figures(*, full: bool, say: Say) -> Iterator[Figure]:
     """Work for minutes, and see what the processes take more."""
     duration_s = _FULL_SOAK_S if full else _SOAK_S
     with tempfile.TemporaryDirectory(prefix="stagectl-soak-") as folder:
-        grown = soak.soak(Path(folder) / "soak", duration_s, _WARM_UP_S, say)
-    said = f"{duration_s:g} s behind {_WARM_UP_S:g} s of warm-up; faults of the host: {len(grown.faults)}"
-    yield judged(SERVO_GROWTH, grown.servo_bytes, reason=said)
-    yield judged(SUPERVISOR_GROWTH, grown.supervisor_bytes / 2**20, reason=said)
-    yield judged(SOAKED, grown.cycles_count, reason="; ".join(grown.faults[:2]))
-    yield judged(SOAK_MISSED, 60.0 * grown.missed_count / duration_s)
+        soaked = soak.soak(Path(folder) / "soak", duration_s, _WARM_UP_S, say)
+    yield from of_soak(soaked, duration_s)
+
+
+def of_soak(soaked: soak.Soaked, duration_s: float) -> Iterator[Figure]:
+    """Judge a soak by the samples of its memory, and by what the stage did."""
+    faults_count = len(soaked.faults)
+    said = f"{duration_s:g} s behind {_WARM_UP_S:g} s of warm-up; last of {len(soaked.servo_bytes)} samples, less the"
+    for bar, unit_bytes, samples in (
+        (SERVO_GROWTH, 1, soaked.servo_bytes),
+        (SUPERVISOR_GROWTH, 2**20, soaked.supervisor_bytes),
+    ):
+        held = f"{samples[0] / 1e6:.3f} MB at first, {min(samples) / 1e6:.3f} to {max(samples) / 1e6:.3f} since"
+        yield judged(bar, soak.growth_bytes(samples) / unit_bytes, reason=f"{said} lowest; {held}")
+    least = soak.least_motions(duration_s)
+    said = f"of {2 * least} that the pauses leave time for; faults of the host: {faults_count}"
+    yield judged(Bar(SOAK_MOTIONS, "motions", least, True), soaked.motions_count, reason=said)
+    yield judged(SOAKED, soaked.cycles_count, reason="; ".join(soaked.faults[:2]))
+    yield judged(SOAK_MISSED, 60.0 * soaked.missed_count / duration_s)

@@ -83,8 +83,10 @@ class Verdict:
     stopped: bool
     travel_m: float
     bound_m: float
-    begun_cycles: float
+    begun_cycles: float | None
+    """None where nothing was noticed that a drive with power had to be stopped for."""
     cycles_lost: int
+    cycles_owed: int
     drift_m: float  # of an axis without power, after standstill; not judged
 
 
@@ -150,7 +152,8 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         found.append((COURSE, "it went on"))
     if not drawn.may_stop and facts.fault_kind:
         found.append((COURSE, f"stopped by {facts.fault_kind}"))
-    travel_m = bound_m = begun = drift_m = 0.0
+    travel_m = bound_m = drift_m = 0.0
+    begun: float | None = None
     end = rests = int(np.searchsorted(t_ns, facts.judged_until_t_ns))
     if not facts.fault_kind and facts.phase in ("stopping", "idle"):  # a homing takes power away and gives it again
         at = int(np.searchsorted(t_ns, facts.fault_t_ns))
@@ -215,7 +218,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             begun = _begun_cycles(seen, record, heard, facts.judged_until_t_ns)
             if not begun <= BEGUN_CYCLES:
                 found.append((BEGUN, f"stop begun {begun:.0f} cycles after detection"))
-    lost = _cycles_lost(facts, record, rests)
+    lost, owed = _cycles_lost(facts, record, rests)
     if lost:
         found.append((LOST, f"{lost} cycles on the bus have no row"))
     found += [(UNREADABLE, text) for text in record.unreadable]
@@ -226,7 +229,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             found.append((NONSENSE, "the stage was opened anew"))
     if facts.trouble:
         found.append((BACK, facts.trouble))
-    return Verdict(tuple(found), stopped, travel_m, bound_m, begun, lost, drift_m)
+    return Verdict(tuple(found), stopped, travel_m, bound_m, begun, lost, owed, drift_m)
 
 
 def _drive_homes(drawn: Drawn, facts: Facts) -> bool:
@@ -371,8 +374,8 @@ def _begun_cycles(seen: dict[str, Any], record: Record, noticed_t_ns: int, until
     return max(0.0, np.ceil(drive_s / CYCLE_S - 1.0))  # a state is seen at the sample after it changed
 
 
-def _cycles_lost(facts: Facts, record: Record, rests: int) -> int:
-    """Count SYNCs on the bus that no row stands for, from the motion's begin until the macro rests or has no power.
+def _cycles_lost(facts: Facts, record: Record, rests: int) -> tuple[int, int]:
+    """Count SYNCs on the bus that no row stands for, and all, from the motion's begin to rest or the power's end.
 
     A cycle has one SYNC, behind its row's instant and before the next one's; a fault may hold it up beyond that. So a
     cycle is lost where rows lie further apart than a cycle and more than one SYNC lies between, and at both ends.
@@ -390,12 +393,13 @@ def _cycles_lost(facts: Facts, record: Record, rests: int) -> int:
     if facts.phase == "homing":  # it has no run before it has power
         first = np.flatnonzero(np.isin(facts.seen["states"], _POWERED).any(axis=1) & (seen_t_ns >= begun_t_ns))
         begun_t_ns = int(seen_t_ns[first[0]]) if first.size else until_t_ns
+    owed = int(((sync > begun_t_ns) & (sync <= until_t_ns)).sum())
     if not rows.size:
-        return int(((sync > begun_t_ns) & (sync <= until_t_ns)).sum())
+        return owed, owed
     cycle_ns = round(1e9 * CYCLE_S)
     places = np.searchsorted(sync, rows)
     between = np.diff(places)
     inside = int((between[np.diff(rows) > 1.5 * cycle_ns] - 1).clip(min=0).sum())
     head = int(((sync > begun_t_ns) & (sync <= rows[0] - cycle_ns)).sum())
     tail = int(((sync > rows[-1] + cycle_ns) & (sync <= until_t_ns)).sum())
-    return inside + head + tail
+    return inside + head + tail, owed

@@ -5,19 +5,24 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
-from bench import service, service_batch, service_processes
+from bench import service, service_batch, service_mutants, service_processes
 from bench.figure import judged
-from bench.journal import APART, Journal, beside_figures, sources_hash
-from bench.mutation import mutants, trial, uncompiled
-from bench.service_mutants import MODULES, equivalent
+from bench.journal import APART, Journal, beside_figures, sources, sources_hash
+from bench.mutation import mutants, put, trial, uncompiled
+from bench.service_mutants import MODULES, Scope, equivalent
 from bench.service_processes import COUNT, COUNT_FULL, FULL_LOSS_SEEDS, LOSS_SEEDS
-from tests.faults import losses, real
+from stagectl.errors import LinkError
+from stagectl.service import lease, messages
+from stagectl.service.desk import Desk
+from stagectl.service.service_log import ServiceLog
+from tests.faults import losses, real, soak
 from tests.faults.judge import BACK, LOST, TRAVEL, _bound_m
 from tests.faults.mechanics import mechanics_of
 from tests.faults.witness import ENABLED
@@ -48,6 +53,7 @@ def entry(kind: str, *violations: tuple[str, str], lost: int = 0, skipped: str =
         "violations": [list(one) for one in violations],
         "begun_cycles": 1.0,
         "cycles_lost": lost,
+        "cycles_owed": 900,
         "drift_m": 0.0,
     }
 
@@ -64,6 +70,29 @@ def test_one_bad_run_is_a_missed_bar_and_says_how_to_see_it_again():
     assert found[service_batch.RECOVERED.figure].value == pytest.approx(50.0)
     lost = {figure.figure: figure for figure in service_batch.of_entries([entry("EMCY", (LOST, "3"), lost=3)], [0])}
     assert (lost[f"batch: {LOST}"].value, lost[f"batch: {LOST}"].holds) == (3.0, False)
+
+
+def test_what_no_run_measured_does_not_hold():
+    """One run in which nothing was noticed and no drive had power, and none at all."""
+    unseen = {**entry("EMCY"), "begun_cycles": None, "cycles_owed": 0}
+    found = {figure.figure: figure for figure in service_batch.of_entries([unseen], [0])}
+    assert found[service_batch.BEGUN.figure].holds is False
+    assert found[f"batch: {LOST}"].holds is False
+    assert found[f"batch: {TRAVEL}"].holds is True
+    two = {figure.figure: figure for figure in service_batch.of_entries([unseen, entry("EMCY")], [0, 1])}
+    assert (two[service_batch.BEGUN.figure].value, two[service_batch.BEGUN.figure].holds) == (1.0, True)
+    assert two[service_batch.BEGUN.figure].reason == "measured in 1 of 2 runs"
+    assert (two[f"batch: {LOST}"].holds, two[f"batch: {LOST}"].reason) == (True, "of 900 cycles in motion")
+    skipped = list(service_batch.of_entries([entry("disk full", skipped="no root")], [0], service_batch.COUNT))
+    assert {figure.holds for figure in skipped} == {False, None}
+    assert sum(figure.holds is False for figure in skipped) == len(service_batch.MISSED) + 3
+
+
+def test_a_run_with_real_processes_that_was_skipped_measured_nothing(monkeypatch):
+    skipped = real.RealResult(0, real.drawn(0), "", (), 0.0, 0.0, 1.0, "mounting a small disk needs root")
+    monkeypatch.setattr(real, "run", lambda seed, folder: skipped)
+    found = list(service_processes.figures(full=False, say=lambda text: None, seeds=[0]))
+    assert {figure.holds for figure in found[1:]} == {False}
 
 
 def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path):
@@ -88,6 +117,38 @@ def test_what_the_journal_leaves_out_is_imported_by_no_process_of_the_service():
     folders = [folder.replace("/", ".") for folder in APART]
     assert all((ROOT / folder).is_dir() for folder in APART)
     assert [one for one in done.stdout.split() if any(f"{one}.".startswith(f"{name}.") for name in folders)] == []
+
+
+def test_the_journal_is_of_all_that_its_runs_import():
+    """Asked of Python itself, which follows each import; and of a copy, whose every byte counts."""
+    parts = ", ".join(f"tests.faults.{name}" for name in ("campaign", "real", "losses", "soak"))
+    code = f"import sys, {parts}; print(*(getattr(one, '__file__', None) for one in list(sys.modules.values())))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    imported = {path for one in done.stdout.split() if (path := Path(one)).is_relative_to(ROOT / "tests")}
+    names = {str(path.relative_to(ROOT)) for path in imported}
+    assert {"tests/service/daemon.py", "tests/small_disk.py", "tests/struck_stage.py", "tests/toml_text.py"} <= names
+    assert imported == {path for path in sources() if path.is_relative_to(ROOT / "tests")}
+
+
+def test_a_byte_of_what_a_run_imports_is_another_journal(tmp_path, monkeypatch):
+    for path in sources():
+        copied = tmp_path / path.relative_to(ROOT)
+        copied.parent.mkdir(parents=True, exist_ok=True)
+        copied.write_bytes(path.read_bytes())
+    assert sources_hash(tmp_path) == sources_hash()
+    (tmp_path / "tests/faults/test_real.py").write_text("assert True\n")  # of which no run knows
+    assert sources_hash(tmp_path) == sources_hash()
+    for name in ("service/daemon.py", "small_disk.py", "struck_stage.py", "toml_text.py", "faults/judge.py"):
+        before = sources_hash(tmp_path)
+        with (tmp_path / "tests" / name).open("a") as file:
+            file.write("# one more line\n")
+        assert sources_hash(tmp_path) != before, name
+    before = sources_hash()
+    for package in ("numpy", "numba", "python-can"):
+        version = metadata.version
+        with monkeypatch.context() as patched:
+            patched.setattr(metadata, "version", lambda one: "0.1" if one == package else version(one))  # noqa: B023
+            assert sources_hash() != before, package
 
 
 def test_a_seed_with_real_processes_is_the_same_run_again_and_all_of_them_are_drawn():
@@ -150,7 +211,7 @@ def test_a_kill_and_a_cut_are_drawn_from_a_seed_in_every_phase_that_is_recorded(
     assert all(one.scene.phase in MOTIONS for strikes in few.values() for one in strikes)
 
 
-def loss_of(folder, rows_ns, syncs_ns, until_ns=99_000_000):
+def loss_of(folder, rows_ns, syncs_ns, until_ns=99_000_000, state=ENABLED):
     """Held against the SYNCs of 0.1 s with power, by two runs, the first of them from before."""
     for name, t_ns in {"1": np.zeros(0, np.int64), "2": rows_ns}.items():
         (folder / name).mkdir(parents=True)
@@ -158,7 +219,7 @@ def loss_of(folder, rows_ns, syncs_ns, until_ns=99_000_000):
         table = pa.table({"t_ns": t_ns, "run_phase": t_ns * 0, "stop": t_ns * 0, **setpoints})
         with pa.ipc.new_stream(str(folder / name / "samples.arrow"), table.schema) as stream:
             stream.write_table(table)
-    seen = {"t_ns": np.arange(102) * 1_000_000, "states": np.full((102, 2), ENABLED), "sync_t_ns": syncs_ns}
+    seen = {"t_ns": np.arange(102) * 1_000_000, "states": np.full((102, 2), state), "sync_t_ns": syncs_ns}
     return losses.loss_of(folder, seen, -1, until_ns)
 
 
@@ -196,6 +257,115 @@ def test_what_a_rig_hears_late_and_at_once_is_no_lost_cycle_and_hides_none(missi
     syncs = rows + 400_000
     syncs[10:60] = syncs[59]
     assert losses.unmatched(np.delete(rows, missing), syncs).sum() == len(missing)
+
+
+def test_a_strike_that_owed_no_row_has_not_held(tmp_path, monkeypatch):
+    """The stage had no power from its begin on: there is nothing that could have been lost."""
+    monkeypatch.setattr(losses, "read_run", lambda folder: None)
+    ms = np.arange(100) * 1_000_000
+    empty = loss_of(tmp_path, ms, ms + 400_000, 100_000_000, state=-1)
+    assert (empty.syncs_count, empty.cycles_lost) == (0, 0)
+    whole = losses.Loss(100, 100, 0)
+    for found in ([empty], [whole, empty], [empty, whole]):
+        for bar in (service_processes.LOST_SERVO, service_processes.LOST_POWER):
+            figure = service_processes.lost_figure(bar, found, [1], "so many")
+            assert figure.holds is False
+            assert "nothing measured" in figure.reason
+    assert service_processes.lost_figure(service_processes.LOST_SERVO, [whole], [1], "").holds is True
+    late = service_processes.lost_figure(service_processes.LOST_POWER, [losses.Loss(900, 600, 300)], [1], "", 1e-3)
+    assert (late.value, late.holds) == (pytest.approx(0.3), False)
+
+
+MB = 1_000_000
+
+
+def soaked(supervisor_mb, servo_bytes=(270 * MB,) * 3, motions=300):
+    supervisor_bytes = tuple(round(one * MB) for one in supervisor_mb)
+    return soak.Soaked(servo_bytes, supervisor_bytes, motions, 1_200_000, 600, ())
+
+
+def of_soak(one, duration_s=1200.0):
+    return {figure.figure: figure for figure in service_processes.of_soak(one, duration_s)}
+
+
+def test_a_leak_does_not_hide_behind_what_was_given_back():
+    """127.9 MB at first, 125.0 then, and 3 MiB more: less than at first, by the end."""
+    growth = service_processes.SUPERVISOR_GROWTH.figure
+    hidden = of_soak(soaked([127.9, 125.0, *np.linspace(125.0, 125.0 + 3 * 2**20 / MB, 20)]))[growth]
+    assert hidden.value == pytest.approx(3.0, abs=1e-5)
+    assert hidden.holds is False
+    assert "127.900 MB at first, 125.000 to 128.146 since" in hidden.reason
+    steady = of_soak(soaked([127.9, 125.0, 125.2, 132.0, 125.3]))[growth]  # the faults' last seconds were written
+    assert (steady.value, steady.holds) == (pytest.approx(0.3 * MB / 2**20, rel=1e-6), True)
+    pages = [270 * MB + 4096 * count for count in (9, 0, 2)]
+    assert of_soak(soaked([125.0], servo_bytes=pages))[service_processes.SERVO_GROWTH.figure].value == 2 * 4096
+
+
+def test_a_soak_whose_stage_stood_still_does_not_hold():
+    """1200 s have room for 750 motions with their pauses of 1.6 s; half of them is the least."""
+    for count, holds in ((0, False), (374, False), (375, True)):
+        figure = of_soak(soaked([125.0], motions=count))[service_processes.SOAK_MOTIONS]
+        assert (figure.value, figure.holds, figure.bar) == (count, holds, ">= 375 motions")
+    assert of_soak(soaked([125.0], motions=56), 180.0)[service_processes.SOAK_MOTIONS].holds is True
+
+
+class Standing:
+    """A house whose stage does as told, but for what a test takes away from it; its pauses are none."""
+
+    def __init__(self, trouble="", sets_off=True, unheard=False, speed_m_per_s=0.0, faults=()):
+        self.trouble, self.sets_off, self.unheard, self.speed_m_per_s = trouble, sets_off, unheard, speed_m_per_s
+        self.faults = iter(faults)
+        self.daemon = self.client = self
+
+    def let_go(self):
+        pass
+
+    def fault(self):
+        return next(self.faults, None)
+
+    def ready(self):
+        return self.trouble
+
+    def set_off(self):
+        if self.unheard:
+            raise LinkError("the stage's service does not answer")
+        return self.sets_off
+
+    def metrics(self):
+        pass
+
+
+@pytest.fixture
+def quick_soak(monkeypatch):
+    """Let 100 s pass in no time."""
+    now_s = [0.0]
+    monkeypatch.setattr(soak.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(soak.time, "sleep", lambda duration_s: now_s.__setitem__(0, now_s[0] + duration_s))
+
+    def work(house):
+        looked, said = [], []
+        count = soak.work(house, 100.0, said, lambda: looked.append(now_s[0]))
+        assert len(looked) > 60
+        return count, said
+
+    return work
+
+
+def test_only_a_motion_that_ran_and_came_to_rest_is_counted(quick_soak):
+    """62 laps of 1.6 s; the last one has no end."""
+    assert quick_soak(Standing()) == (62, [])
+    count, said = quick_soak(Standing(sets_off=False))
+    assert (count, set(said)) == (0, {"a jog did not set off"})
+    assert quick_soak(Standing(speed_m_per_s=0.1))[0] == 0
+    count, said = quick_soak(Standing(unheard=True))
+    assert (count, set(said)) == (0, {"the stage's service does not answer"})
+    fault = messages.Fault.model_construct(kind="EMERGENCY", values="EMCY 0x8700")
+    assert quick_soak(Standing(faults=[None, None, fault])) == (61, ["EMERGENCY: EMCY 0x8700"])
+
+
+def test_a_stage_that_cant_be_armed_ends_the_soak(quick_soak):
+    with pytest.raises(RuntimeError, match="the stage stood still: not armed after 120 s: fault"):
+        quick_soak(Standing(trouble="not armed after 120 s: fault"))
 
 
 def test_a_run_that_cant_be_read_is_counted(tmp_path):
@@ -322,10 +492,79 @@ def test_a_mutant_is_alive_where_no_test_notices_it():
         trial(name, [nothing], ["tests/service/there_is_none.py"], 30.0, said.append)
 
 
+def test_the_default_of_a_field_is_mutated_too():
+    """A lease that is made is not given back: what a mutant makes of that is seen by whoever has the class already."""
+    name = "stagectl.service.lease"
+    made = {one.key: one for one in mutants((ROOT / "stagectl/service/lease.py").read_text())}
+    default = made["Lease: in released: bool = False: False -> True"]
+    assert trial(name, [default], ["tests/service/test_lease_edges.py"], 30.0, lambda text: None).alive == ()
+    assert lease.Lease("t", "anna", 1.0, 1.0).released is False  # here nothing was changed
+
+
+def test_a_property_is_mutated_in_its_place():
+    (one,) = [
+        one
+        for one in MODULES["stagectl.service.desk"].mutants("stagectl.service.desk")
+        if one.function == "Desk._busy" and one.change == "self._current is not None -> self._current is None"
+    ]
+    desk = Desk(ServiceLog(None))
+    getter = Desk._busy.fget
+    assert getter is not None
+    before = getter.__code__
+    try:
+        put(sys.modules[Desk.__module__], one.apply(), one.function)
+        with pytest.raises(AttributeError):
+            desk._busy  # noqa: B018 - None has no end
+    finally:
+        one.revert()
+        getter.__code__ = before
+    assert desk._busy is False
+
+
+SHOWN = {  # modules whose code speaks of a lease, but only shows it or carries it about
+    "batch": "a measurement made up for a loop without a service",
+    "cli": "an option's name",
+    "client": "the other side: one that renews none stops the stage",
+    "linear_loop": "a measurement made up for a loop without a service",
+    "profile": "a key's name",
+    "signals": "a stop's sentence",
+    "service.access": "a header's name",
+    "service.api": "routes to the desk",
+    "service.daemon": "joins the desk to the sockets",
+    "service.faults": "what to do about a fault",
+    "service.messages": "layouts",
+    "service.stage_state": "shows the desk's",
+    "service.stage_world": "joins the desk to the session",
+    "temperatures": "a time that is shorter than a lease",
+}
+
+
+def test_whatever_handles_a_lease_is_mutated():
+    speak = set()
+    for path in [*(ROOT / "stagectl").glob("*.py"), *(ROOT / "stagectl/service").glob("*.py")]:
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        names = {one.attr for one in nodes if isinstance(one, ast.Attribute)}
+        names |= {one.id for one in nodes if isinstance(one, ast.Name)}
+        if any("lease" in name.lower().replace("release", "") for name in names):
+            speak.add(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    assert speak - set(MODULES) - {f"stagectl.{name}" for name in SHOWN} == set()
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_every_equivalent_mutant_exists_and_has_a_reason(module):
-    source = (ROOT / (module.replace(".", "/") + ".py")).read_text()
-    keys = {mutant.key for mutant in mutants(source)}
+    keys = {mutant.key for mutant in MODULES[module].mutants(module)}
     for key, reason in equivalent().get(module, {}).items():
         assert key in keys
         assert len(reason) > 20
+
+
+def test_a_function_that_has_another_name_now_is_missed():
+    named = Scope([], {"Desk.check_order": "", "Desk.gone": ""})
+    with pytest.raises(RuntimeError, match=r"no mutants of Desk\.gone; correct"):
+        named.mutants("stagectl.service.desk")
+
+
+def test_no_mutant_tried_is_none_killed(monkeypatch):
+    monkeypatch.setattr(service_mutants, "MODULES", {})
+    killed, _ = service_mutants.figures(full=True, say=lambda text: None)
+    assert killed.holds is False
