@@ -19,12 +19,14 @@ import numpy as np
 
 from stagectl.errors import RecordError
 from stagectl.record import Recorder, finish_left, free_text
+from stagectl.row import ROW
 from stagectl.run_folder import give_back
 
 RECOVERY_LINK = "current"
 """In the session's folder: leads to the folder that rows of a dead servo belong to."""
 
 _EVENTS_KEPT_COUNT = 1000
+_BLOCK_ROWS_COUNT = 1000
 
 
 class FlightRecorder:
@@ -47,13 +49,12 @@ class FlightRecorder:
         `before_end` is called when the session's last rows are there, and can still save some of them.
         """
         self.folder = folder
-        self.rows_count = 0
         self.trouble = ""
         """What the disk refused; empty where all is well."""
         self.trigger = ""
         """What the run under way was begun by."""
         self._manifest = {**manifest, "session": folder.name, "kept_by": "service"}
-        self._reserve, self._kept_count, self._on_full_disk, self._say = reserve, rows_kept_count, on_full_disk, say
+        self._reserve, self._on_full_disk, self._say = reserve, on_full_disk, say
         self._base: Recorder | None = None
         self._run: Recorder | None = None
         self._run_name = ""
@@ -61,8 +62,7 @@ class FlightRecorder:
         self._before_end = before_end
         self._disk = ThreadPoolExecutor(1, "runs")  # what waits for the disk while the stage moves
         self._next: _Next | None = None
-        self._rows: deque[np.ndarray] = deque()
-        self._rows_held_count = 0
+        self._last = _LastRows(rows_kept_count)
         self._events: deque[tuple[str, int, int, dict[str, Any]]] = deque(maxlen=_EVENTS_KEPT_COUNT)
         with self._policy():
             self._begin_session()
@@ -78,6 +78,11 @@ class FlightRecorder:
                 raise
             self._base = base
         return self._base
+
+    @property
+    def rows_count(self) -> int:
+        """Rows of the session."""
+        return self._last.end_row
 
     @property
     def recovery_folder(self) -> Path:
@@ -117,12 +122,8 @@ class FlightRecorder:
         """Take over rows: into memory, and into the run under way."""
         if len(rows) == 0:
             return
-        self.rows_count += len(rows)
-        self._rows.append(rows)
-        self._rows_held_count += len(rows)
-        while self._rows_held_count - len(self._rows[0]) >= self._kept_count:
-            self._rows_held_count -= len(self._rows.popleft())
-        while self._events and self._events[0][2] < self.rows_count - self._rows_held_count:
+        self._last.take(rows)
+        while self._events and self._events[0][2] < self._last.first_row:
             self._events.popleft()  # of rows that are gone
         with self._policy():
             if self._run is not None and self._next is None and self._run.rows_count >= self._goes_on_at_count:
@@ -318,27 +319,23 @@ class FlightRecorder:
 
     def save_last(self, name: str, trigger: str, text: str) -> None:
         """Write the last seconds as a run of their own, beside one under way."""
-        self.save_window(name, trigger, text, self.rows_count - self._kept_count, self.rows_count)
+        self.save_window(name, trigger, text, self.rows_count - self._last.count, self.rows_count)
 
     def save_window(self, name: str, trigger: str, text: str, first_row: int, end_row: int) -> None:
         """Write the session's rows from `first_row` to before `end_row` as a run, as far as they are kept.
 
         A thread does it, half a minute at 1 kHz is 38 MB; `text` is said once the run is there.
         """
-        kept_from = self.rows_count - self._rows_held_count
-        first_row, end_row = max(first_row, kept_from), min(end_row, self.rows_count)
+        first_row, end_row = max(first_row, self._last.first_row), min(end_row, self.rows_count)
         if end_row <= first_row:
             return
-        pieces: list[np.ndarray] = []
-        for rows in self._rows:
-            pieces.append(rows[max(first_row - kept_from, 0) : max(end_row - kept_from, 0)])
-            kept_from += len(rows)
+        pieces = self._last.pieces(first_row, end_row)
         events = [
             (event, t_ns, row - first_row, fields)
             for event, t_ns, row, fields in self._events
             if first_row <= row < end_row or row == end_row == self.rows_count
         ]
-        self._disk.submit(self._save, name, trigger, text, [rows for rows in pieces if len(rows)], events)
+        self._disk.submit(self._save, name, trigger, text, pieces, events)
 
     def _save(self, name: str, trigger: str, text: str, pieces: list[np.ndarray], events: list[tuple]) -> None:
         try:
@@ -357,6 +354,48 @@ class FlightRecorder:
             self._tell(error)
         else:
             self._say("run", text, run=saved.folder.name, trigger=trigger)
+
+
+class _LastRows:
+    """The last rows of a session, in blocks of one size: one that fell out makes room for the next."""
+
+    def __init__(self, count: int):
+        """Keep `count` rows; those that share a block with the first stay in memory with it."""
+        self.count = count
+        self.end_row = 0
+        """Rows since the session began."""
+        self._blocks: deque[np.ndarray] = deque()
+        self._blocks_from_row = 0
+
+    @property
+    def first_row(self) -> int:
+        """Of what is kept, counted since the session began."""
+        return max(self.end_row - self.count, 0)
+
+    def take(self, rows: np.ndarray) -> None:
+        """Keep rows, shape (n,) of ROW."""
+        while len(rows):
+            used = self.end_row % _BLOCK_ROWS_COUNT
+            if used == 0:
+                self._blocks.append(np.empty(_BLOCK_ROWS_COUNT, ROW))
+            piece = rows[: _BLOCK_ROWS_COUNT - used]
+            # As bytes: numpy copies structured rows field by field, 2 us each.
+            place = self._blocks[-1][used : used + len(piece)]
+            place.view(np.uint8)[:] = np.ascontiguousarray(piece).view(np.uint8)
+            self.end_row += len(piece)
+            rows = rows[len(piece) :]
+        while self._blocks_from_row + _BLOCK_ROWS_COUNT <= self.first_row:
+            self._blocks.popleft()
+            self._blocks_from_row += _BLOCK_ROWS_COUNT
+
+    def pieces(self, first_row: int, end_row: int) -> list[np.ndarray]:
+        """Return rows that are kept, not copied: nothing writes to them again."""
+        found: list[np.ndarray] = []
+        block_row = self._blocks_from_row
+        for block in self._blocks:
+            found.append(block[max(first_row - block_row, 0) : max(end_row - block_row, 0)])
+            block_row += _BLOCK_ROWS_COUNT
+        return [rows for rows in found if len(rows)]
 
 
 class _Next(NamedTuple):

@@ -259,6 +259,8 @@ class Recorder:
     def abandon(self) -> None:
         """Let go of the files as they are: whole up to the last batch, and not marked as ended."""
         self._closed = True
+        # The recorder and its log hold each other: 2.6 MB a run would stay until all garbage is collected.
+        self._pending, self._pending_count = self._pending[:0].copy(), 0
         if self._onto_disk is not None:
             self._onto_disk.close()
         try:

@@ -1,6 +1,7 @@
 """Run folders: written as it happens, whole after every kind of end."""
 
 import contextlib
+import gc
 import json
 import os
 import resource
@@ -731,6 +732,28 @@ while True:
     assert np.array_equal(run.rows["extra_1"], run.rows["cycle"])
     assert recovery.rows_lost_count == 0
     assert len(before.rows) + recovery.rows_count == written_count
+
+
+def test_recorders_that_are_done_keep_no_memory(tmp_path):
+    """Each kept 2.6 MB until all garbage was collected: 36 MB behind 45 faults, in a service that runs for months."""
+    rows = new_rows(50)
+    rows["t_ns"] = np.arange(50) * 1_000_000
+
+    def record(number: int) -> None:
+        recorder = Recorder(tmp_path / str(number), {}, durable=number % 2 == 0)
+        recorder.append(rows)
+        recorder.close() if number % 3 else recorder.abandon()
+
+    record(0)
+    gc.disable()
+    tracemalloc.start()
+    try:
+        for number in range(1, 13):
+            record(number)
+        assert tracemalloc.get_traced_memory()[0] < 500_000
+    finally:
+        tracemalloc.stop()
+        gc.enable()
 
 
 def test_a_recorder_takes_no_more_memory_as_it_goes_on(tmp_path):
