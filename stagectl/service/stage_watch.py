@@ -4,6 +4,7 @@ import time
 
 from stagectl.errors import StagectlError
 from stagectl.requests import Phase
+from stagectl.service import faults
 from stagectl.service.stage_world import ENDING, StageWorld
 from stagectl.service.states import Event, State
 from stagectl.signals import Stop
@@ -22,8 +23,8 @@ class StageWatch(StageWorld):
         except StagectlError as error:
             self._break(error)
             return
-        if status["reference_lost"]:
-            self._homed = False
+        if status["reference_lost"] or Stop(int(status["stop"])) in faults.NEEDS_NEW_SERVO:
+            self._homed = False  # said at once, and not when the fault is acknowledged
         if self._state is not State.FAULT and status["phase"] == Phase.STOPPED:
             self._settle()
         elif self._state is State.ARMED and status["phase"] != Phase.TRACKING:

@@ -432,6 +432,18 @@ def test_a_lost_beam_is_a_fault_and_voids_the_homing(armed):
     assert recall(armed.settings.state_folder)[0].faults_count >= number
 
 
+def test_a_link_that_is_gone_voids_the_homing_at_once(armed):
+    """Its status said *homed* until the fault was acknowledged."""
+    armed.inject(Fault("unplug", duration_s=0.3))
+    armed.until(lambda: armed.status.state == "fault")
+    armed.loop.step()
+    armed.loop.show()
+    assert armed.status.fault.kind == Stop.LINK_LOST.name
+    assert not armed.status.homed
+    assert armed.do("acknowledge", messages.Acknowledge(number=armed.status.fault.number)).state == "done"
+    armed.until(lambda: armed.status.state == "idle")
+
+
 def restarted(folder, remembered):
     """Return the bench of a service that begins with what the last one kept."""
     bench = Bench(folder, remembered=remembered)
