@@ -143,6 +143,13 @@ def said_of_profile(bench):
     return [entry.text for entry in bench.log.last(200) if entry.event == "profile"]
 
 
+def is_opened_as_edited(bench):
+    """Wait for the stage, which must have the limit that was written into its profile."""
+    bench.until(lambda: bench.status.state == "idle")
+    bench.loop.step()
+    assert bench.status.limits.velocity_m_per_s == EDITED_M_PER_S
+
+
 def loses_its_port(bench):
     """Have the interferometer unplugged for a moment; the stage that it is opened anew from is returned."""
     stage = bench.loop._stage
@@ -178,14 +185,10 @@ def test_a_file_that_nobody_said_to_read_again_is_not_read_after_a_fault(tmp_pat
     mine.write_text(changed(mine, {"macro.velocity_limit_m_per_s": EDITED_M_PER_S}))
     again = bench.do("reread", messages.Home())
     assert again.text == "the profile was read again"
-    bench.until(lambda: bench.status.state == "idle")
-    bench.loop.step()
-    assert bench.status.limits.velocity_m_per_s == EDITED_M_PER_S
+    is_opened_as_edited(bench)
     loses_its_port(bench)
     acknowledges(bench)
-    bench.until(lambda: bench.status.state == "idle")
-    bench.loop.step()
-    assert bench.status.limits.velocity_m_per_s == EDITED_M_PER_S
+    is_opened_as_edited(bench)
     assert said_of_profile(bench) == ["read again"]
     end(bench)
 
@@ -196,9 +199,7 @@ def test_a_profile_read_again_while_a_fault_stands_is_the_one_that_is_opened(tmp
     mine.write_text(changed(mine, {"macro.velocity_limit_m_per_s": EDITED_M_PER_S}))
     bench.loop.reread()
     acknowledges(bench)
-    bench.until(lambda: bench.status.state == "idle")
-    bench.loop.step()
-    assert bench.status.limits.velocity_m_per_s == EDITED_M_PER_S
+    is_opened_as_edited(bench)
     assert said_of_profile(bench) == ["read again"]
     end(bench)
 
