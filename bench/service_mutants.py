@@ -1,4 +1,4 @@
-"""Mutation tests of the code that has the last word: guard and lease, run uncompiled against their tests."""
+"""Mutation tests of the code that has the last word, from guard to lease, run uncompiled against their tests."""
 
 import tomllib
 from collections.abc import Callable, Iterator
@@ -86,7 +86,7 @@ MODULES = {
 _TIMEOUT_S = 60.0
 _EVERY = 4  # mutants: one is tried where not all are
 
-KILLED = Bar("mutants of guard and lease killed, of those that are not equivalent", "%", 95.0, True)
+KILLED = Bar("mutants of the code that has the last word killed, of those not equivalent", "%", 95.0, True)
 LISTED = Bar("mutants called equivalent, each with its reason in bench/equivalent_mutants.toml", "mutants")
 
 Say = Callable[[str], None]

@@ -138,6 +138,15 @@ def test_lines_that_are_late_for_good_end_the_run(oled_profile):
     assert "lines were late in each of the last 101 cycles, limit 100" in said
 
 
+def test_late_lines_are_counted_in_fifteen_cycles_at_least(oled_profile):
+    one = Cycle(with_values(oled_profile, trip__sensor_age_s=0.5e-3))
+    one.set(sample_t_ns=one.measurement["t_ns"])
+    assert [one.set(cycle=1304 + k, sequence=1300 + k).stop() for k in range(16)] == [
+        *[Stop.NONE] * 15,
+        Stop.SENSOR_AGE,
+    ]
+
+
 @pytest.mark.parametrize("off_m", [0.199e-3, -0.199e-3])
 def test_a_late_line_is_judged_where_the_reference_was_then(oled_profile, off_m):
     """2 ms at 0.1 m/s and 3 m/s^2 are 200 um less 6 um; without a new line there is nothing to judge."""
