@@ -21,6 +21,7 @@ _WITH_POWER = {"OPERATION_ENABLED", "QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE"
 DRIVES_STOP_S = 5.0
 SERVO_STOPS_S = DRIVES_STOP_S + 2.0
 REST_PATIENCE_S = 60.0
+SEARCH_S = 30.0
 STEP_S = 2.0
 RUNS = Path("/var/lib/stagectl/runs")
 LATE_CYCLES = 8
@@ -39,7 +40,10 @@ def moving() -> Iterator[None]:
 
 @contextmanager
 def homing() -> Iterator[None]:
-    """A stage whose macro drive looks for its index by itself, from where the last fault left it; the lease is held."""
+    """A stage whose macro drive looks for its index by itself, from where the last fault left it; the lease is held.
+
+    It has to be a centimetre off at least: below that the index is found before the drive is up to speed.
+    """
 
     def searches() -> bool:
         # A stage without power moves, too: cogging and cables pull.
@@ -49,7 +53,7 @@ def homing() -> Iterator[None]:
 
     with stage.lease():
         stage.begin("home")
-        until("the drive looks for its index", searches)
+        until(f"the drive looks for its index from {rig.end_m():.4f} m", searches, SEARCH_S)
         yield
 
 

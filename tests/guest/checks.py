@@ -33,9 +33,10 @@ GROUPS: dict[str, tuple[tuple[Group, ...], tuple[Group, ...]]] = {
     "motion": (
         (ready, opened),
         (
-            serial_unplugged, servo_killed, supervisor_hung, servo_out_of_memory, supervisor_out_of_memory,
-            supervisor_killed, moved,  # in this order: what systemd has started again is homed and armed
-            clock_stepped, can_down, recorded,
+            # First those that strike the drive's own homing, while its index is far off; then whatever has to be homed.
+            supervisor_hung, servo_out_of_memory, supervisor_out_of_memory, supervisor_killed,
+            moved,  # what systemd has started again is homed and armed
+            clock_stepped, serial_unplugged, servo_killed, can_down, recorded,  # the first two still homed
         ),
     ),
 }  # fmt: skip

@@ -5,7 +5,7 @@
 set -euo pipefail
 HERE=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 FOLDER=${XDG_CACHE_HOME:-$HOME/.cache}/stagectl-guest
-LIMIT_S=${GUEST_LIMIT_S:-1800}
+LIMIT_S=${GUEST_LIMIT_S:-2700} # of each machine: `motion` takes 15 to 25 minutes on two processors, by the host
 
 [[ $EUID -eq 0 ]] || {
   echo "guest-test makes a disk image and has to be root: sudo make guest-test" >&2
