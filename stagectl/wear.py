@@ -97,7 +97,7 @@ def alarm(estimate: BacklashEstimate, limits: WearLimits, sds_count: float = _AL
         )
     found = (estimate.left_stiffness_n_per_m, estimate.right_stiffness_n_per_m)
     sds = (estimate.left_stiffness_sd_n_per_m, estimate.right_stiffness_sd_n_per_m)
-    for side, value, sd, believed in zip(("left", "right"), found, sds, limits.stiffness_n_per_m, strict=True):
+    for side, value, sd, believed in zip(_SIDES, found, sds, limits.stiffness_n_per_m, strict=True):
         change = value / believed - 1.0
         if _is_beyond(change, limits.stiffness_change_limit_ratio, sd / believed, sds_count):
             worn.append(

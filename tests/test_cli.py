@@ -104,6 +104,13 @@ def test_help_loads_nothing_heavy():
     assert process.stdout.rstrip().endswith("set()")
 
 
+def test_what_a_command_records_is_in_memory_of_libc():
+    code = "from stagectl import cli; import pyarrow; print(pyarrow.default_memory_pool().backend_name)"
+    environment = {name: value for name, value in os.environ.items() if name != "ARROW_DEFAULT_MEMORY_POOL"}
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=60)
+    assert process.stdout == "system\n", process.stderr
+
+
 # ---- wrong usage and errors ---------------------------------------------------------------------------------------
 
 

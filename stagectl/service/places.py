@@ -29,8 +29,11 @@ def default_socket() -> Path:
 
 def is_served(path: Path) -> bool:
     """Tell whether a socket's path is a service's, also of one that is too busy to answer, or not for us."""
-    if not path.is_socket():
-        return False
+    try:
+        if not path.is_socket():
+            return False
+    except PermissionError:  # nor is its folder for us
+        return True
     asked = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         asked.settimeout(1.0)

@@ -42,6 +42,18 @@ def test_the_socket_is_for_owner_and_group(tmp_path):
     listen_unix(path).close()  # a dead service's socket is no obstacle
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
+def test_a_socket_in_a_folder_that_is_not_for_us_is_served(tmp_path):
+    path = tmp_path / "run" / "stage.socket"
+    with listen_unix(path):
+        path.parent.chmod(0o700)
+        os.seteuid(65534)
+        try:
+            assert is_served(path)
+        finally:
+            os.seteuid(0)
+
+
 def test_a_service_too_busy_to_answer_keeps_its_socket(tmp_path):
     path = tmp_path / "stage.socket"
     with contextlib.ExitStack() as waiting, listen_unix(path) as listening:
