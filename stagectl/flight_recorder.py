@@ -335,7 +335,7 @@ class FlightRecorder:
             for event, t_ns, row, fields in self._events
             if first_row <= row < end_row or row == end_row == self.rows_count
         ]
-        self._disk.submit(self._save, name, trigger, text, pieces, events)
+        self._last.lend(self._disk.submit(self._save, name, trigger, text, pieces, events))
 
     def _save(self, name: str, trigger: str, text: str, pieces: list[np.ndarray], events: list[tuple]) -> None:
         try:
@@ -357,7 +357,10 @@ class FlightRecorder:
 
 
 class _LastRows:
-    """The last rows of a session, in blocks of one size: one that fell out makes room for the next."""
+    """The last rows of a session, in blocks of one size: one that fell out is written to again.
+
+    Made anew each second, they left the supervisor's memory one block larger at times, where another took its place.
+    """
 
     def __init__(self, count: int):
         """Keep `count` rows; those that share a block with the first stay in memory with it."""
@@ -366,6 +369,8 @@ class _LastRows:
         """Rows since the session began."""
         self._blocks: deque[np.ndarray] = deque()
         self._blocks_from_row = 0
+        self._free: list[np.ndarray] = []
+        self._readers: list[Future[None]] = []
 
     @property
     def first_row(self) -> int:
@@ -377,7 +382,7 @@ class _LastRows:
         while len(rows):
             used = self.end_row % _BLOCK_ROWS_COUNT
             if used == 0:
-                self._blocks.append(np.empty(_BLOCK_ROWS_COUNT, ROW))
+                self._blocks.append(self._free.pop() if self._free else np.empty(_BLOCK_ROWS_COUNT, ROW))
             piece = rows[: _BLOCK_ROWS_COUNT - used]
             # As bytes: numpy copies structured rows field by field, 2 us each.
             place = self._blocks[-1][used : used + len(piece)]
@@ -385,11 +390,18 @@ class _LastRows:
             self.end_row += len(piece)
             rows = rows[len(piece) :]
         while self._blocks_from_row + _BLOCK_ROWS_COUNT <= self.first_row:
-            self._blocks.popleft()
+            fallen_out = self._blocks.popleft()
             self._blocks_from_row += _BLOCK_ROWS_COUNT
+            self._readers = [reader for reader in self._readers if not reader.done()]
+            if not self._readers:
+                self._free.append(fallen_out)
+
+    def lend(self, reader: Future[None]) -> None:
+        """Write to none of the blocks again that are here now, or fall out, before `reader` is done."""
+        self._readers.append(reader)
 
     def pieces(self, first_row: int, end_row: int) -> list[np.ndarray]:
-        """Return rows that are kept, not copied: nothing writes to them again."""
+        """Return rows that are kept, not copied: who reads them in a thread has them lent."""
         found: list[np.ndarray] = []
         block_row = self._blocks_from_row
         for block in self._blocks:

@@ -613,6 +613,32 @@ def test_a_window_of_the_session_is_a_run_of_its_own(tmp_path):
     assert said == [("run", "around")] * 2
 
 
+def test_rows_of_a_window_are_not_written_to_before_they_are_saved(tmp_path):
+    """Here the disk takes none before the session has gone on for several times what is kept."""
+    session, disk_works = flight(tmp_path, kept_count=3000), threading.Event()
+    session.append(rows_from(0, 3500))
+    session._disk.submit(disk_works.wait)
+    session.save_window("event", "reversal", "around", 600, 3400)
+    for first in range(3500, 20_000, 50):
+        session.append(rows_from(first, 50))
+    disk_works.set()
+    session.close()
+    (folder,) = tmp_path.glob("*-event")
+    assert read_run(folder).rows["cycle"].tolist() == list(range(600, 3400))
+
+
+def test_the_last_rows_are_kept_in_the_same_memory_all_the_time(tmp_path):
+    session, blocks = flight(tmp_path, kept_count=3000), {}
+    for first in range(0, 30_000, 50):
+        session.append(rows_from(first, 50))
+        blocks |= {id(block): block for block in session._last._blocks}  # held: another would have another place
+        if first == 5000:
+            session.save_last("asked", "request", "the last")
+            session._disk.submit(int).result()
+    assert len(blocks) <= 5
+    session.close()
+
+
 def test_nothing_waits_for_the_disk_while_the_stage_moves(tmp_path, monkeypatch):
     """Windows, runs on request and their ends: the stage's thread has a lease to renew meanwhile."""
     slow, moves = threading.Event(), threading.Event()
