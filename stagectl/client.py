@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from stagectl.errors import (
     DriveError,
@@ -28,10 +28,12 @@ from stagectl.errors import (
 from stagectl.service import messages
 from stagectl.service.places import default_socket
 
+_JOIN = "join the group of its service (stagectl), or ask who runs it"
 _TIMEOUT_S = 5.0
 _WAIT_S = 5.0
 _RENEWALS_PER_LEASE = 4
 _BLOCK_COUNT = 50
+_STOP = "/v1/stop"
 _STOP_TRIES, _KEYED_TRIES = 3, 2
 _REST_S, _LOOK_S = 30.0, 0.05
 _WITHOUT_POWER = ("off", "idle", "fault")
@@ -45,6 +47,16 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 def error_of(failure: messages.Failure) -> StagectlError:
     """Return the error that the service tells of."""
     return _KINDS.get(failure.kind, RequestError)(failure.message)
+
+
+def _checked(kind: type[ModelT], **values: Any) -> ModelT:
+    """Make a request of the API; RequestError where a value can't be in it."""
+    try:
+        return kind(**values)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        place = ".".join(str(part) for part in problem["loc"])
+        raise RequestError(f"{place} is {problem['input']!r}: {problem['msg']}") from error
 
 
 def _new_key() -> str:
@@ -123,7 +135,7 @@ class Client:
 
         The same key (16 characters or more) again gets the same lease, while that lasts.
         """
-        body = messages.TakeLease(holder=holder, duration_s=duration_s)
+        body = _checked(messages.TakeLease, holder=holder, duration_s=duration_s)
         taken = messages.TakenLease.model_validate(self._once("POST", "/v1/lease", body, key))
         self.lease_token = taken.token
         return taken
@@ -171,7 +183,7 @@ class Client:
 
     def arm(self, law: messages.LawName | None = None) -> messages.Command:
         """Give the drives power and hold."""
-        return self.do("arm", messages.Arm(law=law))
+        return self.do("arm", _checked(messages.Arm, law=law))
 
     def home(self) -> messages.Command:
         """Home both axes; ends armed."""
@@ -179,15 +191,15 @@ class Client:
 
     def move(self, target_m: float, law: messages.LawName | None = None) -> messages.Command:
         """Move the end to a position."""
-        return self.do("move", messages.Move(target_m=target_m, law=law))
+        return self.do("move", _checked(messages.Move, target_m=target_m, law=law))
 
     def jog(self, distance_m: float, law: messages.LawName | None = None) -> messages.Command:
         """Move the end by a distance."""
-        return self.do("jog", messages.JogBy(distance_m=distance_m, law=law))
+        return self.do("jog", _checked(messages.JogBy, distance_m=distance_m, law=law))
 
     def identify(self, frequency_hz: float | None = None, duration_s: float = 20.0) -> messages.Command:
         """Identify the backlash."""
-        return self.do("identify", messages.Identify(frequency_hz=frequency_hz, duration_s=duration_s))
+        return self.do("identify", _checked(messages.Identify, frequency_hz=frequency_hz, duration_s=duration_s))
 
     def probe(self) -> messages.Command:
         """Touch both edges of the joint, where the profile permits it."""
@@ -195,19 +207,19 @@ class Client:
 
     def acknowledge(self, number: int) -> messages.Command:
         """Take note of a fault; enables nothing."""
-        return self.do("acknowledge", messages.Acknowledge(number=number))
+        return self.do("acknowledge", _checked(messages.Acknowledge, number=number))
 
     def swap_backend(self, backend: str) -> messages.Command:
         """Work in another world; without power only."""
-        return self.do("backend", messages.SwapBackend.model_validate({"backend": backend}))
+        return self.do("backend", _checked(messages.SwapBackend, backend=backend))
 
     def begin_jog(self, hold_s: float = 0.3) -> messages.Command:
         """Begin to jog, at rest; `jog_at` with the answer's key says how fast, before `hold_s` is over."""
-        return self.begin("jogging", messages.BeginJog(hold_s=hold_s))
+        return self.begin("jogging", _checked(messages.BeginJog, hold_s=hold_s))
 
     def jog_at(self, key: str, velocity_m_per_s: float, hold_s: float = 0.3) -> messages.Command:
         """Jog at a velocity; to be said again before `hold_s` is over. JogOver where it was not: begin a new one."""
-        body = messages.JogAt(velocity_m_per_s=velocity_m_per_s, hold_s=hold_s)
+        body = _checked(messages.JogAt, velocity_m_per_s=velocity_m_per_s, hold_s=hold_s)
         return messages.Command.model_validate(self._ask("PUT", f"/v1/jogging/{key}", body))
 
     def scan(self, program: messages.Scan) -> messages.Command:
@@ -221,7 +233,7 @@ class Client:
             text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
             raise RequestError(f"trajectory {path}: {error}; give a readable CSV file") from error
-        return self.do("follow", messages.Follow(text=text, name=name or "trajectory", law=law))
+        return self.do("follow", _checked(messages.Follow, text=text, name=name or "trajectory", law=law))
 
     def send_setpoints(
         self, first_number: int, period_s: float, position_m: list[float], last: bool = False, key: str = ""
@@ -230,7 +242,9 @@ class Client:
 
         `key` is the stream's, of the first answer or one's own; with it nothing goes into another stream.
         """
-        body = messages.Setpoints(first_number=first_number, period_s=period_s, position_m=position_m, last=last)
+        body = _checked(
+            messages.Setpoints, first_number=first_number, period_s=period_s, position_m=position_m, last=last
+        )
         return messages.StreamState.model_validate(self._once("PUT", "/v1/setpoints", body, key))
 
     def stream_state(self) -> messages.StreamState | None:
@@ -266,11 +280,13 @@ class Client:
 
     def stop(self) -> messages.Status:
         """Bring the stage to rest and take the power away; needs no lease. Tried again where the link fails."""
-        return messages.Status.model_validate(self._again(_STOP_TRIES, "POST", "/v1/stop"))
+        return messages.Status.model_validate(self._again(_STOP_TRIES, "POST", _STOP))
 
     def record(self, name: str = "request") -> messages.Status:
         """Begin a run, where none is under way; needs no lease."""
-        return messages.Status.model_validate(self._once("POST", "/v1/record", messages.StartRecord(name=name)))
+        return messages.Status.model_validate(
+            self._once("POST", "/v1/record", _checked(messages.StartRecord, name=name))
+        )
 
     def end_record(self) -> messages.Status:
         """End the run that was asked for; needs no lease."""
@@ -335,6 +351,17 @@ class Client:
         answer = self._answer(method, path, body, headers, params, more_s)
         return answer.json() if answer.content else None
 
+    def _look_for(self, path: Path) -> None:
+        """Say what stands in the way to the service's socket. Errors: LinkError."""
+        try:
+            is_there = path.is_socket()
+        except PermissionError as error:
+            raise LinkError(f"{self.place}: its folder is not for this user; {_JOIN}") from error
+        except OSError as error:
+            raise LinkError(f"{self.place}: no socket can be there: {error.strerror}; give another --socket") from error
+        if not is_there:
+            raise LinkError(f"{self.place}: no service has its socket there; is `stagectl serve` running?")
+
     def _answer(
         self,
         method: str,
@@ -344,9 +371,16 @@ class Client:
         params: dict[str, Any] | None = None,
         more_s: float = 0.0,
     ) -> httpx.Response:
-        if self._path is not None and not self._path.is_socket():
-            raise LinkError(f"{self.place}: no service has its socket there; is `stagectl serve` running?")
+        if self._path is not None:
+            self._look_for(self._path)
         lease = {"Stagectl-Lease": self.lease_token} if self.lease_token else {}
+        if not (self.lease_token.isascii() and self.lease_token.isprintable()):
+            if path != _STOP:  # which needs none
+                raise RequestError(
+                    f"the lease (--lease, $STAGECTL_LEASE) is {self.lease_token[:60]!r}, which is no token; give "
+                    "that of `stagectl lease --hold`"
+                )
+            lease = {}
         try:
             answer = self._http.request(
                 method,
@@ -357,6 +391,8 @@ class Client:
                 json=None if body is None else body.model_dump(),
             )
         except httpx.HTTPError as error:
+            if "Permission denied" in str(error):
+                raise LinkError(f"{self.place}: it is not for this user; {_JOIN}") from error
             raise LinkError(
                 f"{self.place}: no answer from the service ({error}); is `stagectl serve` running?"
             ) from error

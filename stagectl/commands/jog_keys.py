@@ -11,17 +11,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from rich.markup import escape
+
 from stagectl.client import Client
-from stagectl.commands.answer import Answer, Voice
-from stagectl.commands.remote import connected, follow, leased
-from stagectl.errors import JogOver, RequestError
+from stagectl.commands.answer import ENDED_EARLY, EXIT_CODES, Answer, Voice
+from stagectl.commands.remote import answered, connected, leased, prepared
+from stagectl.errors import JogOver, LinkError, RequestError
 from stagectl.service import messages
 
 FIRST_HOLD_S = 0.6
 """Of a key pressed anew: keyboards repeat after half a second."""
 
 NEXT_HOLD_S = 0.2
-_STEP_S = 0.05
+_STEP_S, _LOOK_S = 0.05, 0.5
+_HOLDS = ("armed", "moving")
 _RIGHT, _LEFT = (b"\x1b[C", b"\x1bOC", b"l", b"d"), (b"\x1b[D", b"\x1bOD", b"h", b"a")
 _FASTER, _SLOWER, _LEAVE = (b"\x1b[A", b"\x1bOA", b"+"), (b"\x1b[B", b"\x1bOB", b"-"), (b"q", b"\x04")
 
@@ -69,37 +72,51 @@ def jog(voice: Voice, socket: Path | None, token: str | None, speed_m_per_s: flo
     with connected(socket) as stage, leased(voice, stage, token):
         status = stage.status()
         voice.note(status.banner)
-        if not status.homed:
-            follow(voice, stage, "home", messages.Home())
-        if stage.status().state == "idle":
-            follow(voice, stage, "arm", messages.Arm())
+        failed = prepared(voice, stage, status, "jog")
+        if failed is not None:
+            return answered(failed, stage.status())
         limits = stage.status().limits
         top_m_per_s = math.inf if limits is None else limits.jog_velocity_m_per_s
         voice.note("hold left or right to move, up and down double and halve the speed, space lets go, q ends")
         with _bare_keys(sys.stdin.fileno()) as fileno:
-            _follow_keys(voice, stage, Hand(speed_m_per_s, top_m_per_s), fileno)
-        found = stage.status()
-    return Answer({"end_position_m": found.positions.end_position_m, "state": found.state}, ["let go"])
+            ended = _follow_keys(voice, stage, Hand(speed_m_per_s, top_m_per_s), fileno)
+        found = ended or stage.status()
+    data = {"end_position_m": found.positions.end_position_m, "state": found.state}
+    if ended is None:
+        return Answer(data, ["let go"])
+    fault = ended.fault
+    text = f"the stage is {ended.state}" if fault is None else f"{fault.kind}: {fault.values}; {fault.remedy}"
+    is_link = fault is not None and fault.kind in ("LINK_LOST", "LinkError")
+    return Answer(data, [f"[red]ended early[/]: {escape(text)}"], EXIT_CODES[LinkError] if is_link else ENDED_EARLY)
 
 
-def _follow_keys(voice: Voice, stage: Client, hand: Hand, fileno: int) -> None:
-    key, was_moving = "", False
+def _follow_keys(voice: Voice, stage: Client, hand: Hand, fileno: int) -> messages.Status | None:
+    """Follow the keys until they leave; returns how the stage stands where it took no more before."""
+    key, was_moving, look_s = "", False, 0.0
     while not hand.leaves:
         voice.check()
         if select.select([fileno], [], [], _STEP_S)[0]:
             keys = os.read(fileno, 256)
             if not keys:
-                return
+                return None
             hand.press(keys, time.monotonic())
         asked_s = time.monotonic()
         wanted = hand.wanted_m_per_s(asked_s)
+        if wanted == 0.0 and not was_moving and asked_s >= look_s:  # by nothing else it is heard that it holds no more
+            look_s = asked_s + _LOOK_S
+            found = stage.status()
+            if found.state not in _HOLDS:
+                return found
         if wanted != 0.0 and not key:
             key = stage.begin_jog().key  # which may take its time: what the keys want is looked at again
         elif wanted != 0.0 or was_moving:
             key = _gone_on(stage, key, wanted)
+            if not key and (found := stage.status()).state not in _HOLDS:
+                return found
         was_moving = wanted != 0.0
         if time.monotonic() - asked_s > NEXT_HOLD_S:
             let_go_meanwhile(hand, fileno)
+    return None
 
 
 def let_go_meanwhile(hand: Hand, fileno: int) -> None:

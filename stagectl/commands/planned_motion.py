@@ -1,6 +1,7 @@
 """`stagectl scan`, `follow` and `stream`: motion over time through the service."""
 
 import itertools
+import math
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -51,6 +52,7 @@ def stream(voice: Voice, socket: Path | None, token: str | None, period_s: float
         raise RequestError("standard input is empty; give positions in metres, one a line")
     with remote.connected(socket) as stage:
         status = stage.status()
+        remote.refuse_unreachable(status, remote.checked("Move", target_m=first))
         voice.note(f"{status.profile} through the service: {status.banner}")
         with remote.leased(voice, stage, token):
             command = remote.prepared(voice, stage, status, "stream")
@@ -67,6 +69,9 @@ def _numbers(lines: Iterable[str]) -> Iterator[float]:
         if not line.strip():
             continue
         try:
-            yield float(line)
-        except ValueError as error:
-            raise RequestError(f"line {number} is {line.strip()[:60]!r}; give one position in metres a line") from error
+            position_m = float(line)
+        except ValueError:
+            position_m = math.nan
+        if not math.isfinite(position_m):
+            raise RequestError(f"line {number} is {line.strip()[:60]!r}; give one position in metres a line")
+        yield position_m

@@ -16,13 +16,14 @@ from rich.table import Table
 
 from stagectl.client import Client, error_of
 from stagectl.commands.answer import ENDED_EARLY, EXIT_CODES, Answer, Voice
-from stagectl.errors import LinkError, RequestError
+from stagectl.errors import LinkError, RecordError, RequestError
 from stagectl.service import messages
 from stagectl.service.places import default_socket, is_served
 
 _LEASE_S = 3.0
 _POLL_S, _LOOK_S, _HEED_S = 0.2, 0.05, 3.0
 _FINISHED = "FINISHED"
+_MOTION = "arm"  # what begins the run of a motion
 
 
 def served(socket: Path | None, lease: str | None, in_place: bool) -> bool:
@@ -109,6 +110,7 @@ def motion(
     with connected(socket) as stage:
         status = stage.status()
         _refuse_other(status, profile, usual_profile, backend)
+        refuse_unreachable(status, body)
         voice.note(f"{status.profile} through the service: {status.banner}")
         with leased(voice, stage, token):
             command = prepared(voice, stage, status, name)
@@ -132,6 +134,25 @@ def _refuse_other(status: messages.Status, profile: str, usual_profile: str, bac
             f"--backend {backend}: the service has {status.backend or 'none yet'}; change that with "
             "`stagectl backend`, or add --in-place for a stage of its own"
         )
+
+
+def refuse_unreachable(status: messages.Status, body: BaseModel) -> None:
+    """Refuse what lies beyond the travel before anything is homed, has power or moves. Errors: RequestError."""
+    if status.limits is None:
+        return
+    low_m, high_m = status.limits.travel_m
+    travel = f"the travel of {status.profile} is [{low_m:g}, {high_m:g}] m"
+    asked: dict[str, float | None] = {}
+    if isinstance(body, messages.Move):
+        asked = {"target_m": body.target_m}
+    elif isinstance(body, messages.Scan):
+        asked = {f"segments.{k}.target_m": segment.target_m for k, segment in enumerate(body.segments)}
+        asked["start_m"] = body.start_m
+    elif isinstance(body, messages.JogBy) and not abs(body.distance_m) <= high_m - low_m:
+        raise RequestError(f"distance_m is {body.distance_m:g}: {travel}; give a distance within it")
+    for place, position_m in asked.items():
+        if position_m is not None and not low_m <= position_m <= high_m:
+            raise RequestError(f"{place} is {position_m:g}: {travel}; give a position within it")
 
 
 def prepared(voice: Voice, stage: Client, status: messages.Status, name: str) -> messages.Command | None:
@@ -358,8 +379,17 @@ def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> An
             stage.end_record()
             status = _once_heeded(stage, lambda found: found is None or found.trigger != "request")
         elif name is not None:
-            stage.record(checked("StartRecord", name=name).name)  # pyright: ignore[reportAttributeAccessIssue]
-            status = _once_heeded(stage, lambda found: found is not None and bool(found.run or found.trouble))
+            body = checked("StartRecord", name=name)
+            before = status.recording
+            if before is not None and before.run and before.trigger != _MOTION:
+                raise RequestError(f"--name {name}: {before.run} is under way; end it with `stagectl record --end`")
+            stage.record(body.name)  # pyright: ignore[reportAttributeAccessIssue]
+            status = _once_heeded(stage, lambda found: _is_begun(found, before))
+            if status.recording is None or not status.recording.run:
+                trouble = "the stage is not connected" if status.recording is None else status.recording.trouble
+                raise RecordError(f"no run was begun: {trouble or f'not within {_HEED_S:g} s; see `stagectl log`'}")
+            if status.recording.trigger == _MOTION:
+                voice.note(f"{name} begins when the motion's run ends")
     voice.note(status.banner)
     found = status.recording
     text = "nothing: the stage is not connected"
@@ -367,6 +397,13 @@ def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> An
         text = f"{found.run}, begun by {found.trigger}" if found.run else "the last seconds only, in memory"
     shown = [escape(text), *([f"[red]{escape(found.trouble)}[/]"] if found is not None and found.trouble else [])]
     return Answer({"recording": None if found is None else found.model_dump()}, shown)
+
+
+def _is_begun(found: messages.Recording | None, before: messages.Recording | None) -> bool:
+    """Tell whether a run is under way, or what is wrong is another thing than before."""
+    return found is not None and bool(
+        found.run or (found.trouble and (before is None or found.trouble != before.trouble))
+    )
 
 
 def _once_heeded(stage: Client, heeded: Callable[[messages.Recording | None], bool]) -> messages.Status:

@@ -34,6 +34,8 @@ def is_served(path: Path) -> bool:
             return False
     except PermissionError:  # nor is its folder for us
         return True
+    except OSError:  # a name too long for a file
+        return False
     asked = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         asked.settimeout(1.0)

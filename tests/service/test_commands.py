@@ -5,6 +5,7 @@ import json
 import os
 import pty
 import select
+import signal
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ import pytest
 
 from stagectl import cli
 from stagectl.commands.jog_keys import FIRST_HOLD_S, NEXT_HOLD_S, Hand, let_go_meanwhile
+from tests.service.daemon import servo_pid
 
 pytestmark = pytest.mark.real_time
 
@@ -97,7 +99,7 @@ def test_what_is_no_program_is_refused_with_its_place(call, tmp_path, monkeypatc
         ("scan", "repeat_count = 1", "segments"),
         ("scan", "[[segments]]\ntarget_mm = 3", "segments.0.target_m"),
         ("scan", "[[segments", "give a readable TOML file"),
-        ("scan", "[[segments]]\ntarget_m = 3.0", "position_m is"),
+        ("scan", "[[segments]]\ntarget_m = 3.0", "segments.0.target_m is 3: the travel of"),
         ("follow", "t,x\n0,1", "it must be 't_s,position_m'"),
         ("follow", "t_s,position_m\n0,0\n1,100", "are these millimetres?"),
     ):
@@ -211,6 +213,22 @@ def test_keys_jog_while_they_are_held(idle):
     finally:
         end(leader, jogging)
     assert -0.06 < moved_m < -0.01
+
+
+def test_keys_end_with_the_fault_that_takes_the_stage_away(idle):
+    """No key is held: by keys alone nobody would hear of it, and q was a success."""
+    leader, jogging = keys_jog(idle)
+    try:
+        if idle.state_is("armed", "fault") and idle.recovers():
+            end(leader, jogging)
+            leader, jogging = keys_jog(idle)
+        idle.state_is("armed")
+        os.kill(servo_pid(idle), signal.SIGKILL)
+        assert jogging.wait(30.0) == 3
+    finally:
+        end(leader, jogging)
+    idle.state_is("fault")
+    idle.recovers()
 
 
 def test_what_was_typed_while_a_request_was_under_way_is_held_no_more():

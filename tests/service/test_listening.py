@@ -50,8 +50,17 @@ def test_a_socket_in_a_folder_that_is_not_for_us_is_served(tmp_path):
         os.seteuid(65534)
         try:
             assert is_served(path)
+            with Client(path) as client, pytest.raises(LinkError, match="not for this user; join the group of its"):
+                client.stop()
         finally:
             os.seteuid(0)
+
+
+def test_no_socket_can_have_such_a_name(tmp_path):
+    path = tmp_path / ("a" * 300) / "stage.socket"
+    assert not is_served(path)
+    with Client(path) as client, pytest.raises(LinkError, match="no socket can be there: File name too long"):
+        client.status()
 
 
 def test_a_service_too_busy_to_answer_keeps_its_socket(tmp_path):

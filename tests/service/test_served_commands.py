@@ -1,7 +1,9 @@
 """The command line through a service on the rig in virtual time: exit codes, what is said, and what is left behind."""
 
 import contextlib
+import io
 import json
+import math
 import os
 import re
 import signal
@@ -12,7 +14,7 @@ import pytest
 from stagectl import cli
 from stagectl.client import Client
 from stagectl.commands.answer import INTERRUPTED
-from stagectl.errors import StagectlError
+from stagectl.errors import RequestError, StagectlError
 from stagectl.record import read_manifest
 from stagectl.service import messages
 from tests.service.served import PATIENCE_S, Served
@@ -296,6 +298,48 @@ def test_a_lease_that_is_lost_ends_the_holding(idle, call):
     assert "the lease was lost: it was not renewed in time; the stage was stopped" in err
 
 
+# ---- what is refused before anything has power ---------------------------------------------------------------------
+
+
+def test_what_lies_beyond_the_travel_gives_nothing_power(idle, ask, tmp_path, monkeypatch):
+    """Told by the service after it had armed, it had homed a stage for a target that it can't go to."""
+    program = tmp_path / "far.toml"
+    program.write_text("start_m = 0\n[[segments]]\ntarget_m = 0.01\n[[segments]]\ntarget_m = 3.0\n")
+    before = len(idle.client.log(limit=1000))
+    for arguments, lines, said in (
+        (("move", "--target-m", 5), "", "target_m is 5: the travel of oled-printer is [-0.45, 0.45] m"),
+        (("jog", "--distance-m", 5), "", "distance_m is 5: the travel"),
+        (("scan", program), "", "segments.1.target_m is 3: the travel"),
+        (("stream",), "1.0\n", "target_m is 1: the travel"),
+        (("stream",), "nan\n", "line 1 is 'nan'; give one position"),
+        (("stream",), "1e999\n", "line 1 is '1e999'; give one position"),
+    ):
+        monkeypatch.setattr("sys.stdin", io.StringIO(lines))
+        code, answer, _ = ask(*arguments)
+        assert (code, said in answer["error"]["message"]) == (2, True), answer
+    assert len(idle.client.log(limit=1000)) == before
+
+
+def test_a_value_that_no_request_can_have_is_refused(idle):
+    with pytest.raises(RequestError, match="target_m is nan"):
+        idle.client.move(math.nan)
+    with pytest.raises(RequestError, match=r"position_m\.1 is inf"):
+        idle.client.send_setpoints(0, 0.01, [0.0, math.inf])
+
+
+@pytest.mark.parametrize("lease", ["é", "a\nb"])
+def test_a_lease_that_is_no_token_is_refused_and_stops_all_the_same(ask, lease):
+    code, answer, _ = ask("move", "--target-m", 0.0, "--lease", lease)
+    assert (code, "which is no token" in answer["error"]["message"]) == (2, True)
+    assert ask("stop")[0] == 0
+
+
+def test_a_stop_needs_no_token(idle):
+    with Client(idle.socket) as client:
+        client.lease_token = "é"
+        assert client.stop().state == "idle"
+
+
 # ---- record, trigger, log --------------------------------------------------------------------------------------------
 
 
@@ -309,13 +353,30 @@ def test_a_run_is_begun_shown_and_ended(idle, call, ask):
     run = answer["recording"]["run"]
     assert run.endswith("-service-warm-up")
     assert call("record")[1] == f"{run}, begun by request\n"
-    assert call("record", "--name", "another")[1] == f"{run}, begun by request\n"  # one at a time
+    code, answer, _ = ask("record", "--name", "another")  # one at a time
+    assert (code, f"--name another: {run} is under way; end it" in answer["error"]["message"]) == (2, True)
     code, answer, _ = ask("record", "--end")
     assert (code, answer["recording"]["run"]) == (0, "")
     manifest = read_manifest(idle.bench.settings.runs_root / run)
     assert (manifest["record"]["state"], manifest["end"]["stop"]) == ("closed", "OPERATOR")
     assert manifest["record"]["rows_count"] > 0
     assert call("record", "--end")[0] == 0
+
+
+def test_a_run_that_the_disk_refuses_is_no_success(idle, ask):
+    """Nor is the next one, of which the status says the same as of the first."""
+    runs = idle.bench.settings.runs_root
+    aside = runs.rename(runs.with_name("aside"))
+    runs.write_text("no folder")
+    try:
+        for name in ("one", "two"):
+            code, answer, _ = ask("record", "--name", name)
+            assert (code, "no run was begun: " in answer["error"]["message"]) == (5, True), answer
+    finally:
+        runs.unlink()
+        aside.rename(runs)
+    assert ask("record", "--name", "three")[0] == 0
+    assert ask("record", "--end")[0] == 0
 
 
 def test_what_can_t_be_recorded_is_refused_with_its_option(ask):
