@@ -23,7 +23,7 @@ from stagectl.service.places import default_socket, is_served
 _LEASE_S = 3.0
 _POLL_S, _LOOK_S, _HEED_S = 0.2, 0.05, 3.0
 _FINISHED = "FINISHED"
-_MOTION = "arm"  # what begins the run of a motion
+_MOTION, _REQUEST = "arm", "request"  # what a run was begun by
 
 
 def served(socket: Path | None, lease: str | None, in_place: bool) -> bool:
@@ -382,7 +382,10 @@ def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> An
             body = checked("StartRecord", name=name)
             before = status.recording
             if before is not None and before.run and before.trigger != _MOTION:
-                raise RequestError(f"--name {name}: {before.run} is under way; end it with `stagectl record --end`")
+                remedy = (
+                    "end it with `stagectl record --end`" if before.trigger == _REQUEST else "it has the rows already"
+                )
+                raise RequestError(f"--name {name}: {before.run} is under way, begun by {before.trigger}; {remedy}")
             stage.record(body.name)  # pyright: ignore[reportAttributeAccessIssue]
             status = _once_heeded(stage, lambda found: _is_begun(found, before))
             if status.recording is None or not status.recording.run:

@@ -194,14 +194,24 @@ def end(leader, jogging):
     os.close(leader)
 
 
+def armed_keys_jog(idle):
+    """Start it, and wait for the stage to hold; after a hiccup of the host once more."""
+    leader, jogging = keys_jog(idle)
+    if idle.state_is("armed", "fault") and idle.recovers():
+        end(leader, jogging)
+        leader, jogging = keys_jog(idle)
+    try:
+        idle.state_is("armed")
+    except AssertionError:
+        end(leader, jogging)
+        raise
+    return leader, jogging
+
+
 def test_keys_jog_while_they_are_held(idle):
     before_m = idle.plant["macro_position_m"]
-    leader, jogging = keys_jog(idle)
+    leader, jogging = armed_keys_jog(idle)
     try:
-        if idle.state_is("armed", "fault") and idle.recovers():
-            end(leader, jogging)
-            leader, jogging = keys_jog(idle)
-        idle.state_is("armed")
         until_s = time.monotonic() + 1.5
         while time.monotonic() < until_s:
             os.write(leader, LEFT)
@@ -217,12 +227,8 @@ def test_keys_jog_while_they_are_held(idle):
 
 def test_keys_end_with_the_fault_that_takes_the_stage_away(idle):
     """No key is held: by keys alone nobody would hear of it, and q was a success."""
-    leader, jogging = keys_jog(idle)
+    leader, jogging = armed_keys_jog(idle)
     try:
-        if idle.state_is("armed", "fault") and idle.recovers():
-            end(leader, jogging)
-            leader, jogging = keys_jog(idle)
-        idle.state_is("armed")
         os.kill(servo_pid(idle), signal.SIGKILL)
         assert jogging.wait(30.0) == 3
     finally:

@@ -354,7 +354,10 @@ def test_a_run_is_begun_shown_and_ended(idle, call, ask):
     assert run.endswith("-service-warm-up")
     assert call("record")[1] == f"{run}, begun by request\n"
     code, answer, _ = ask("record", "--name", "another")  # one at a time
-    assert (code, f"--name another: {run} is under way; end it" in answer["error"]["message"]) == (2, True)
+    assert (code, f"--name another: {run} is under way, begun by request; end it" in answer["error"]["message"]) == (
+        2,
+        True,
+    )
     code, answer, _ = ask("record", "--end")
     assert (code, answer["recording"]["run"]) == (0, "")
     manifest = read_manifest(idle.bench.settings.runs_root / run)
