@@ -11,6 +11,7 @@ import heapq
 import json
 import os
 import select
+import shutil
 import signal
 import sys
 import time
@@ -209,6 +210,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="seed of all noise (default 0)")
     parser.add_argument("--faults", type=Path, help="TOML file with [[faults]] tables, instants from the start")
     parser.add_argument("--truth", type=Path, help="write what really happened to this .npz file at the end")
+    parser.add_argument("--own-folder", type=Path, help="folder to remove at the end, where the parent is gone by then")
     parser.add_argument(
         "--linger-s", type=float, default=0.0, help="go on this long after the parent's end (default 0)"
     )
@@ -267,6 +269,8 @@ def main(argv: list[str] | None = None) -> int:
         served.close()
         if arguments.truth is not None:
             served.rig.truth.write(arguments.truth)
+        if arguments.own_folder is not None and os.getppid() != parent_pid:  # who made it was killed
+            shutil.rmtree(arguments.own_folder, ignore_errors=True)
     return status
 
 

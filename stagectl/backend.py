@@ -528,6 +528,7 @@ class RigBackend(RealtimeBackend):
         self._truth_path = self._folder / "truth.npz"
         command = [sys.executable, "-m", "sim_backend", str(machine), "--socket", self._rig_channel, "--pty-link", port]
         command += ["--seed", str(seed), "--truth", str(self._truth_path), "--linger-s", str(linger_s)]
+        command += ["--own-folder", str(self._folder)]
         self._rig = _Child("rig", command)
         try:
             self._servo()  # begun now, for both to compile side by side

@@ -290,7 +290,9 @@ def identify(
 
     def work(voice: "Voice") -> "Answer":
         if backend != "plant" and commands.remote.served(socket, lease, in_place):
-            body = commands.remote.checked("Identify", frequency_hz=frequency_hz, duration_s=duration_s)
+            body = commands.remote.checked(
+                commands.remote.messages.Identify, frequency_hz=frequency_hz, duration_s=duration_s
+            )
             return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "identify", body)
         return commands.motion.identify(voice, profile, backend, runs, seed, frequency_hz, duration_s)
 
@@ -323,7 +325,7 @@ def jog(
         if distance_m is None:
             return commands.jog_keys.jog(voice, socket, lease, velocity_m_per_s)
         if commands.remote.served(socket, lease, in_place):
-            body = commands.remote.checked("JogBy", distance_m=distance_m, law=law)
+            body = commands.remote.checked(commands.remote.messages.JogBy, distance_m=distance_m, law=law)
             return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "jog", body)
         return commands.motion.jog(voice, profile, backend, runs, seed, distance_m, law)
 
@@ -347,7 +349,7 @@ def move(
 
     def work(voice: "Voice") -> "Answer":
         if commands.remote.served(socket, lease, in_place):
-            body = commands.remote.checked("Move", target_m=target_m, law=law)
+            body = commands.remote.checked(commands.remote.messages.Move, target_m=target_m, law=law)
             return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "move", body)
         shape = commands.planning.Shape(None, None, None, None, None, None, None, target_m)
         return commands.motion.run(voice, profile, backend, runs, seed, "move", shape, law)
@@ -370,7 +372,7 @@ def home(
 
     def work(voice: "Voice") -> "Answer":
         if commands.remote.served(socket, lease, in_place):
-            body = commands.remote.checked("Home")
+            body = commands.remote.checked(commands.remote.messages.Home)
             return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "home", body)
         return commands.motion.home(voice, profile, backend, runs, seed)
 

@@ -54,9 +54,7 @@ def _checked(kind: type[ModelT], **values: Any) -> ModelT:
     try:
         return kind(**values)
     except ValidationError as error:
-        problem = error.errors()[0]
-        place = ".".join(str(part) for part in problem["loc"])
-        raise RequestError(f"{place} is {problem['input']!r}: {problem['msg']}") from error
+        raise RequestError(messages.sentence(error.errors()[0])) from error
 
 
 def _new_key() -> str:
@@ -303,6 +301,10 @@ class Client:
     def begin(self, name: str, body: BaseModel, key: str = "") -> messages.Command:
         """Send a command and don't wait; the same key again is the same command."""
         return messages.Command.model_validate(self._once("POST", f"/v1/{name}", body, key))
+
+    def check(self, name: str, body: BaseModel) -> None:
+        """Ask whether the stage could do a motion, before it is homed and armed for it. RequestError where it can't."""
+        self._again(_KEYED_TRIES, "POST", f"/v1/check/{name}", body)
 
     def command(self, key: str, wait_s: float = 0.0) -> messages.Command:
         """Return what became of a command; waits for its end where asked to."""

@@ -447,3 +447,15 @@ def test_a_jog_that_can_not_be_is_refused_before_anything_opens(capsys, tmp_path
     assert code == 2
     assert "--distance-m" in err
     assert not runs.exists()  # no run was begun: the stage did not even home
+
+
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_an_answer_that_no_disk_takes_is_told_as_that(more):
+    command = [sys.executable, "-m", "stagectl.cli", "profile", "list", *more]
+    with open("/dev/full", "w") as full:
+        process = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
+    assert process.returncode == 5
+    assert (
+        process.stderr
+        == "RecordError\nstdout: can't be written: No space left on device; what was to be said there is lost\n"
+    )

@@ -41,6 +41,26 @@ def test_a_rig_that_is_killed_ends_a_jog_with_3(tmp_path):
     assert not read_run(Path(answer["run"])).truncated
 
 
+def test_a_rig_whose_command_is_killed_leaves_nothing(tmp_path):
+    command = [sys.executable, "-m", "stagectl.cli", "jog", "--distance-m", "0.1", "--backend", "rig"]
+    process = subprocess.Popen(
+        [*command, "--runs", str(tmp_path)],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    )
+    for line in process.stderr:
+        if line.startswith("homing the macro"):
+            break
+    assert list(tmp_path.glob("stagectl-rig-*/can.socket"))
+    process.kill()
+    process.communicate()
+    give_up_s = time.monotonic() + 60.0
+    while list(tmp_path.glob("stagectl-rig-*")) and time.monotonic() < give_up_s:
+        time.sleep(0.1)
+    assert list(tmp_path.glob("stagectl-rig-*")) == []
+
+
 def test_an_interrupt_brings_the_stage_to_rest_and_closes_the_run(tmp_path):
     command = [sys.executable, "-m", "stagectl.cli", "run", "--backend", "batch", "--runs", str(tmp_path), "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

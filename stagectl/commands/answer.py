@@ -1,10 +1,12 @@
 """How a command speaks: one answer on stdout, progress and errors on stderr, an exit code that means something."""
 
 import codecs
+import contextlib
 import json
 import math
+import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -90,6 +92,7 @@ def deliver(command: str, as_json: bool, work: Callable[[Voice], Answer], compil
     try:
         with interruption, voice.progress:
             answer = work(voice)
+        _say_answer(command, as_json, answer)
     except StagectlError as error:
         code = EXIT_CODES.get(type(error), ENDED_EARLY)
         _say_error(command, as_json, console, voice, error, code)
@@ -97,13 +100,37 @@ def deliver(command: str, as_json: bool, work: Callable[[Voice], Answer], compil
     except KeyboardInterrupt as interrupt:
         _say_interrupted(command, as_json, console, voice)
         raise typer.Exit(INTERRUPTED) from interrupt
+    raise typer.Exit(answer.exit_code)
+
+
+@contextlib.contextmanager
+def onto_stdout() -> Iterator[None]:
+    """Turn what a full disk says into RecordError; a pipe that nobody reads any more ends the command quietly."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())  # what Python still holds for it would fail once more at the exit
+        os.close(nowhere)
+        raise RecordError(f"stdout: can't be written: {error.strerror}; what was to be said there is lost") from error
+
+
+def say_line(text: str) -> None:
+    """Say a line on stdout that doesn't wait for the answer. Errors: RecordError where it can't be written."""
+    with onto_stdout():
+        print(text, flush=True)
+
+
+def _say_answer(command: str, as_json: bool, answer: Answer) -> None:
     if as_json:
         _print_json({"command": command, "exit_code": answer.exit_code, **answer.data})
-    else:
-        out = Console()
+        return
+    out = Console()
+    with onto_stdout():
         for part in answer.shown:
             out.print(part, highlight=False, soft_wrap=isinstance(part, str))
-    raise typer.Exit(answer.exit_code)
 
 
 def _say_where_compiled_code_goes(voice: Voice) -> None:
@@ -118,8 +145,7 @@ def _print_json(value: dict[str, Any]) -> None:
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     if codecs.lookup(sys.stdout.encoding or "ascii").name != "utf-8" or _has_raw_bytes(text):
         text = json.dumps(content, indent=2, allow_nan=False)
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    say_line(text)
 
 
 def _has_raw_bytes(text: str) -> bool:
@@ -152,7 +178,9 @@ def _say_error(
         voice.note(f"the run up to here: {run}")
     if as_json:
         failure = {"kind": kind, "message": str(error)}
-        _print_json({"command": command, "exit_code": exit_code, "error": failure, "run": run, **_ending(run)})
+        said = {"command": command, "exit_code": exit_code, "error": failure, "run": run, **_ending(run)}
+        with contextlib.suppress(RecordError):  # of stdout itself; the reason stands on stderr
+            _print_json(said)
 
 
 def _say_interrupted(command: str, as_json: bool, console: Console, voice: Voice) -> None:

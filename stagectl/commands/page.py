@@ -5,7 +5,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from stagectl.commands.answer import Answer, Voice
+from stagectl.commands.answer import Answer, Voice, say_line
 from stagectl.page.admission import ENTRY, Admission, Sessions
 from stagectl.page.application import application
 from stagectl.page.reports import Reports
@@ -31,7 +31,7 @@ def page(voice: Voice, socket: Path | None, port: int, runs_root: Path, as_json:
     def show(role: Role) -> None:
         # On stdout, where scripts look; a token in the address works once and is worthless after that.
         url = f"{address}{ENTRY}?token={sessions.link_token(role)}"
-        print(json.dumps({"role": role, "url": url}) if as_json else f"{_ROLES[role]}  {url}", flush=True)
+        say_line(json.dumps({"role": role, "url": url}) if as_json else f"{_ROLES[role]}  {url}")
 
     sessions = Sessions(show)
     with tempfile.TemporaryDirectory(prefix="stagectl-page-") as drawn:

@@ -27,9 +27,7 @@ def _program(path: Path) -> messages.Scan:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise RequestError(f"{path}: {error}; give a readable TOML file with [[segments]]") from error
     except ValidationError as error:
-        problem = error.errors()[0]
-        place = ".".join(str(part) for part in problem["loc"])
-        raise RequestError(f"{path}: {place} is {str(problem['input'])[:60]}: {problem['msg']}") from error
+        raise RequestError(f"{path}: {messages.sentence(error.errors()[0])}") from error
 
 
 def follow(
@@ -40,7 +38,7 @@ def follow(
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise RequestError(f"trajectory {path}: {error}; give a CSV file with the header t_s,position_m") from error
-    body = remote.checked("Follow", text=text, law=law)
+    body = remote.checked(messages.Follow, text=text, law=law)
     return remote.motion(voice, socket, token, usual_profile, usual_profile, "auto", "follow", body)
 
 
@@ -52,7 +50,7 @@ def stream(voice: Voice, socket: Path | None, token: str | None, period_s: float
         raise RequestError("standard input is empty; give positions in metres, one a line")
     with remote.connected(socket) as stage:
         status = stage.status()
-        remote.refuse_unreachable(status, remote.checked("Move", target_m=first))
+        stage.check("move", remote.checked(messages.Move, target_m=first))
         voice.note(f"{status.profile} through the service: {status.banner}")
         with remote.leased(voice, stage, token):
             command = remote.prepared(voice, stage, status, "stream")

@@ -8,22 +8,26 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
-from rich.console import RenderableType
+from rich.console import Console, RenderableType
 from rich.markup import escape
 from rich.table import Table
 
 from stagectl.client import Client, error_of
-from stagectl.commands.answer import ENDED_EARLY, EXIT_CODES, Answer, Voice
+from stagectl.commands.answer import ENDED_EARLY, EXIT_CODES, Answer, Voice, onto_stdout, say_line
 from stagectl.errors import LinkError, RecordError, RequestError
 from stagectl.service import messages
 from stagectl.service.places import default_socket, is_served
 
+ModelT = TypeVar("ModelT", bound=BaseModel)
+CHECKED = ("move", "jog", "identify", "scan", "follow")
+"""Motions that the service is asked about before the stage is homed and armed for them."""
 _LEASE_S = 3.0
 _POLL_S, _LOOK_S, _HEED_S = 0.2, 0.05, 3.0
 _FINISHED = "FINISHED"
-_MOTION, _REQUEST = "arm", "request"  # what a run was begun by
+_MOTION = "arm"  # what a motion's run was begun by
 
 
 def served(socket: Path | None, lease: str | None, in_place: bool) -> bool:
@@ -45,14 +49,14 @@ def served(socket: Path | None, lease: str | None, in_place: bool) -> bool:
     return False
 
 
-def checked(kind: str, /, **values: object) -> BaseModel:
-    """Make a request of the API; RequestError where a value can't be in it."""
+def checked(kind: type[ModelT], /, **values: Any) -> ModelT:
+    """Make a request of the API; RequestError where the value of an option can't be in it."""
     try:
-        return getattr(messages, kind)(**values)
+        return kind(**values)
     except ValidationError as error:
         problem = error.errors()[0]
-        place = ".".join(str(part) for part in problem["loc"]).replace("_", "-")
-        raise RequestError(f"--{place} is {problem['input']!r}: {problem['msg']}") from error
+        option = "--" + ".".join(str(part) for part in problem["loc"]).replace("_", "-")
+        raise RequestError(messages.sentence({**problem, "loc": (option,)})) from error
 
 
 def connected(socket: Path | None) -> Client:
@@ -110,7 +114,8 @@ def motion(
     with connected(socket) as stage:
         status = stage.status()
         _refuse_other(status, profile, usual_profile, backend)
-        refuse_unreachable(status, body)
+        if name in CHECKED:
+            stage.check(name, body)
         voice.note(f"{status.profile} through the service: {status.banner}")
         with leased(voice, stage, token):
             command = prepared(voice, stage, status, name)
@@ -134,25 +139,6 @@ def _refuse_other(status: messages.Status, profile: str, usual_profile: str, bac
             f"--backend {backend}: the service has {status.backend or 'none yet'}; change that with "
             "`stagectl backend`, or add --in-place for a stage of its own"
         )
-
-
-def refuse_unreachable(status: messages.Status, body: BaseModel) -> None:
-    """Refuse what lies beyond the travel before anything is homed, has power or moves. Errors: RequestError."""
-    if status.limits is None:
-        return
-    low_m, high_m = status.limits.travel_m
-    travel = f"the travel of {status.profile} is [{low_m:g}, {high_m:g}] m"
-    asked: dict[str, float | None] = {}
-    if isinstance(body, messages.Move):
-        asked = {"target_m": body.target_m}
-    elif isinstance(body, messages.Scan):
-        asked = {f"segments.{k}.target_m": segment.target_m for k, segment in enumerate(body.segments)}
-        asked["start_m"] = body.start_m
-    elif isinstance(body, messages.JogBy) and not abs(body.distance_m) <= high_m - low_m:
-        raise RequestError(f"distance_m is {body.distance_m:g}: {travel}; give a distance within it")
-    for place, position_m in asked.items():
-        if position_m is not None and not low_m <= position_m <= high_m:
-            raise RequestError(f"{place} is {position_m:g}: {travel}; give a position within it")
 
 
 def prepared(voice: Voice, stage: Client, status: messages.Status, name: str) -> messages.Command | None:
@@ -224,9 +210,18 @@ def watch(voice: Voice, socket: Path | None, as_json: bool, looks_count: int | N
     with connected(socket) as stage:
         found = stage.status()
         if as_json:
-            _look_again(voice, stage, looks_count, lambda seen: print(seen.model_dump_json(), flush=True))
+            _look_again(voice, stage, looks_count, lambda seen: say_line(seen.model_dump_json()))
             return Answer({"looks_count": looks_count}, [])
-        with Live(status_table(found), console=voice.console, auto_refresh=False) as live:
+        out = Console()
+
+        def add(seen: messages.Status) -> None:  # into a pipe or a file: each look behind the last
+            with onto_stdout():
+                out.print(status_table(seen), "")
+
+        if not out.is_terminal:
+            _look_again(voice, stage, looks_count, add)
+            return Answer({}, [])
+        with Live(status_table(found), console=out, auto_refresh=False) as live:
             _look_again(voice, stage, looks_count, lambda seen: live.update(status_table(seen), refresh=True))
     return Answer({}, [])
 
@@ -358,7 +353,7 @@ def lease(voice: Voice, socket: Path | None, hold: bool, as_json: bool) -> Answe
             return Answer({"lease": None if held is None else held.model_dump()}, [escape(text)])
         with stage.lease(_holder(), _LEASE_S) as taken:
             voice.left_behind = "the lease was given back; the stage is without power"
-            print(taken.model_dump_json() if as_json else f"export STAGECTL_LEASE={taken.token}", flush=True)
+            say_line(taken.model_dump_json() if as_json else f"export STAGECTL_LEASE={taken.token}")
             voice.note("held until Ctrl-C; then the stage comes to rest without power")
             _look_again(voice, stage, None, lambda seen: _still_ours(seen, taken.holder))
     return Answer({}, [])
@@ -379,14 +374,9 @@ def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> An
             stage.end_record()
             status = _once_heeded(stage, lambda found: found is None or found.trigger != "request")
         elif name is not None:
-            body = checked("StartRecord", name=name)
+            body = checked(messages.StartRecord, name=name)
             before = status.recording
-            if before is not None and before.run and before.trigger != _MOTION:
-                remedy = (
-                    "end it with `stagectl record --end`" if before.trigger == _REQUEST else "it has the rows already"
-                )
-                raise RequestError(f"--name {name}: {before.run} is under way, begun by {before.trigger}; {remedy}")
-            stage.record(body.name)  # pyright: ignore[reportAttributeAccessIssue]
+            stage.record(body.name)
             status = _once_heeded(stage, lambda found: _is_begun(found, before))
             if status.recording is None or not status.recording.run:
                 trouble = "the stage is not connected" if status.recording is None else status.recording.trouble
@@ -417,19 +407,23 @@ def _once_heeded(stage: Client, heeded: Callable[[messages.Recording | None], bo
     return found
 
 
-def trigger(voice: Voice, socket: Path | None, body: dict | None, reversal: bool, end: bool) -> Answer:
+def trigger(voice: Voice, socket: Path | None, asked: dict[str, Any], reversal: bool, end: bool) -> Answer:
     """Show which event is waited for, set one, or end that."""
-    if reversal and body is not None and (body["error_m"] is not None or body["contact_force_n"] is not None):
+    level = "error_m" in asked or "contact_force_n" in asked
+    if reversal and level:
         raise RequestError("--reversal and a level are both given; give one of them")
-    if end and body is not None:
+    if end and (reversal or asked):
         raise RequestError("--end and an event are both given; give one of them")
+    if asked and not (reversal or level):
+        option = "--" + next(iter(asked)).replace("_", "-")
+        raise RequestError(f"{option} is of an event that is not given; add --error-m, --contact-force-n or --reversal")
     with connected(socket) as stage:
         status = stage.status()
         if end:
             stage.end_trigger()
             status = _once_heeded(stage, lambda found: found is None or not found.waits_for)
-        elif body is not None:
-            stage.set_trigger(messages.SetTrigger.model_validate(checked("SetTrigger", **body).model_dump()))
+        elif reversal or level:
+            stage.set_trigger(checked(messages.SetTrigger, **asked))
             status = _once_heeded(stage, lambda found: found is not None and bool(found.waits_for))
     voice.note(status.banner)
     found = status.recording
@@ -441,7 +435,7 @@ def backend(voice: Voice, socket: Path | None, token: str | None, name: str | No
     """Show which world it is, or change it."""
     with connected(socket) as stage:
         if name is not None:
-            asked = checked("SwapBackend", backend=name)
+            asked = checked(messages.SwapBackend, backend=name)
             with leased(voice, stage, token):
                 follow(voice, stage, "backend", asked)
         found = stage.status()

@@ -45,9 +45,9 @@ RecordName = Annotated[str | None, option("Begin a run of this name.", "--name",
 TriggerError = Annotated[float | None, option("An error above this.", "--error-m")]
 TriggerContact = Annotated[float | None, option("A contact with more than this.", "--contact-force-n")]
 TriggerReversal = Annotated[bool, option("A reversal.", "--reversal")]
-TriggerBefore = Annotated[float, option("How much before it.", "--before-s")]
-TriggerAfter = Annotated[float, option("How much after it.", "--after-s")]
-TriggerCount = Annotated[int, option("How often.", "--count", min=1, max=1000)]
+TriggerBefore = Annotated[float | None, option("How much before it (default 1).", "--before-s")]
+TriggerAfter = Annotated[float | None, option("How much after it (default 1).", "--after-s")]
+TriggerCount = Annotated[int | None, option("How often (default 1).", "--count", min=1, max=1000)]
 EndTrigger = Annotated[bool, option("Wait for no event any more.", "--end")]
 EndRecord = Annotated[bool, option("End the run that was asked for.", "--end")]
 World = Annotated[
@@ -141,18 +141,18 @@ def trigger(
     error_m: TriggerError = None,
     contact_force_n: TriggerContact = None,
     reversal: TriggerReversal = False,
-    before_s: TriggerBefore = 1.0,
-    after_s: TriggerAfter = 1.0,
-    count: TriggerCount = 1,
+    before_s: TriggerBefore = None,
+    after_s: TriggerAfter = None,
+    count: TriggerCount = None,
     end: EndTrigger = False,
     socket: Socket = None,
     json: Json = False,
 ) -> None:
     """Record what is around an event: an error above a level, a contact, a reversal; or show and end that."""
-    values = {"error_m": error_m, "contact_force_n": contact_force_n}
-    asked = reversal or any(value is not None for value in values.values())
-    body = {**values, "before_s": before_s, "after_s": after_s, "count": count} if asked else None
-    deliver("trigger", json, lambda voice: commands.remote.trigger(voice, socket, body, reversal, end), compiles=False)
+    given = {"error_m": error_m, "contact_force_n": contact_force_n}
+    given |= {"before_s": before_s, "after_s": after_s, "count": count}
+    asked = {name: value for name, value in given.items() if value is not None}
+    deliver("trigger", json, lambda voice: commands.remote.trigger(voice, socket, asked, reversal, end), compiles=False)
 
 
 @service_app.command(epilog=epilog("stagectl log --lines 50"))

@@ -21,10 +21,10 @@ Application = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 BODY_LIMIT_BYTES = 64 * 1024
 TABLE_LIMIT_BYTES = 2 * 1024 * 1024
-"""For a motion's table, on its own path."""
+"""For a motion's table, on its own paths."""
 
 LEASE_HEADER = b"stagectl-lease"
-_TABLE_PATH = "/v1/follow"
+_TABLE_PATHS = ("/v1/follow", "/v1/check/follow")
 _TOKEN_BYTES = 24
 _LEAST_TOKEN_LETTERS = 20
 
@@ -103,7 +103,7 @@ async def let_in(application: Application, role: Role, scope: Scope, receive: Re
     """Pass a connection on with its role, unless its body is above the limit."""
     scope["stagectl_role"] = role
     length = header(scope, b"content-length")
-    most = TABLE_LIMIT_BYTES if scope.get("path") == _TABLE_PATH and role is Role.OPERATE else BODY_LIMIT_BYTES
+    most = TABLE_LIMIT_BYTES if scope.get("path") in _TABLE_PATHS and role is Role.OPERATE else BODY_LIMIT_BYTES
     if length and (not length.isdigit() or int(length) > most):
         await refuse(scope, send, 413, f"Content-Length {length[:20]}: the limit is {most} bytes")
         return

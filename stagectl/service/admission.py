@@ -16,6 +16,7 @@ import termios
 from collections.abc import Callable, Collection
 from typing import Any
 
+import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from stagectl.service.access import Application, Receive, Scope, Send
@@ -48,6 +49,19 @@ class Connection(H11Protocol):
             silent = [one for one in others if one.is_silent]
             if silent:
                 min(silent, key=lambda one: (one.is_the_operators, one.begun_s)).transport.close()
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what is no HTTP, where nothing was answered yet, and end the connection.
+
+        uvicorn's own would answer twice where such bytes come behind a refusal, and the application after it where they
+        come first; h11 raises at the second answer.
+        """
+        if self.cycle is not None:
+            self.cycle.disconnected = True
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            super().send_400_response(msg)
+        else:
+            self.transport.close()
 
     @property
     def is_the_operators(self) -> bool:

@@ -111,15 +111,7 @@ def _answer_errors(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        return _failure(422, "RequestError", "; ".join(_sentence(one) for one in error.errors()[:10]))
-
-
-def _sentence(problem: Any) -> str:
-    """Say what is wrong with one value of a request: place, value, limit."""
-    place = ".".join(str(part) for part in problem.get("loc", ()))
-    value = repr(problem.get("input"))
-    shown = value if len(value) <= 60 else f"{value[:60]}..."
-    return f"{place}: {problem.get('msg', 'is wrong')}, got {shown}".encode("utf-8", "backslashreplace").decode()
+        return _failure(422, "RequestError", "; ".join(messages.sentence(one) for one in error.errors()[:10]))
 
 
 def _watch_routes(app: FastAPI, desk: Desk, log: ServiceLog, figures: Figures, runs_root: Path) -> None:
@@ -217,6 +209,24 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
 
     planner("scan", messages.Scan, "Follow a scan program; checked against all limits before the first cycle.")
     planner("follow", messages.Follow, "Follow a table of times and positions; checked before the first cycle.")
+
+    def checker(name: str, model: type) -> None:
+        def check(body: Any) -> None:
+            desk.check(name, body)
+
+        check.__annotations__["body"] = model
+        check.__doc__ = (
+            f"Tell whether this stage could do that {name}, before it is homed and armed for it; 422 if not."
+        )
+        check.__name__ = f"check_{name}"
+        app.post(f"/v1/check/{name}", status_code=204, dependencies=_OPERATES)(check)  # plans too: in a thread
+
+    checker("move", messages.Move)
+    checker("jog", messages.JogBy)
+    checker("identify", messages.Identify)
+    checker("probe", messages.Probe)
+    checker("scan", messages.Scan)
+    checker("follow", messages.Follow)
 
     @app.get("/v1/setpoints")
     async def stream_state() -> messages.StreamState | None:

@@ -15,11 +15,13 @@ from typing import Any
 from pydantic import BaseModel
 
 from stagectl.errors import JogOver, RequestError, StagectlError
+from stagectl.motion import travel_from
 from stagectl.profile import Profile
 from stagectl.service import lease as leases
 from stagectl.service import messages, plans, states
 from stagectl.service.lease import Lease, LeaseRefused
 from stagectl.service.motions import MOTIONS
+from stagectl.service.recording import ARM, REQUEST
 from stagectl.service.scope import Scope
 from stagectl.service.service_log import ServiceLog, now_text
 from stagectl.service.states import State
@@ -122,6 +124,10 @@ def _unfit() -> Iterator[None]:
         yield
     except RequestError as error:
         raise Unfit(str(error)) from error
+
+
+def _not_connected(name: str) -> RequestError:
+    return RequestError(f"{name}: the stage is not connected; `stagectl status` says what it waits for")
 
 
 def _stream_begun(order: Order, count: int) -> messages.StreamState:
@@ -323,9 +329,21 @@ class Desk:
                 raise Busy("another client asks the same just now; ask again")
             if self.profile is None:
                 raise Busy("there is nothing to record: the stage is not connected")
+            if name:
+                self._refuse_second_run(name)
             self._record_request = name
             self._keep(key, "record", name)
             self._log.say("record", name or "end")
+
+    def _refuse_second_run(self, name: str) -> None:
+        """Refuse a run where one is under way that has the rows already; behind a motion's own it may begin. Busy."""
+        under_way = None if self._status is None else self._status.recording
+        if under_way is None or not under_way.run or under_way.trigger == ARM:
+            return
+        remedy = (
+            "end that first (`stagectl record --end`)" if under_way.trigger == REQUEST else "it has the rows already"
+        )
+        raise Busy(f"name {name}: {under_way.run} is under way, begun by {under_way.trigger}; {remedy}")
 
     def set_trigger(self, body: messages.SetTrigger | None, key: str = "") -> None:
         """Wait for an event to record, or for none any more; needs no lease. Errors: Busy, Ending, Unfit."""
@@ -363,9 +381,25 @@ class Desk:
             if used is not None:
                 return used.answer.message()
         profile, holds_m = self._where_it_holds(name, token)
+        self._check_values(name, body)
         with _unfit():
-            plan = plans.scanned(body, profile, holds_m) if name == "scan" else plans.followed(body, profile)
+            plan = plans.planned(body, profile, holds_m)
         return self.submit(name, plans.kept(body), key, token, plan)
+
+    def check(self, name: str, body: Any) -> None:
+        """Refuse a motion that this stage can't do, as submitting it would; begins nothing, and needs no lease.
+
+        For whoever must home and arm first: both are motion too. Where the stage is not homed yet it will hold at the
+        homed zero. Errors: RequestError, Unfit.
+        """
+        with self._lock:
+            self._refuse_when_closed()
+            profile, holds_m = self.profile, self._homed_setpoint_m
+            if profile is None:
+                raise _not_connected(name)
+            self._check_values(name, body)
+        with _unfit():
+            plans.planned(body, profile, 0.0 if holds_m is None else holds_m)
 
     def take_setpoints(self, body: messages.Setpoints, token: str, key: str = "") -> messages.StreamState:
         """Begin a stream, or take what goes on with it; `key` is the stream's, the same with each of its blocks.
@@ -411,9 +445,9 @@ class Desk:
             self._refuse_when_closed()
             leases.holds(self._lease, token, self._clock_s())
             profile, holds_m = self.profile, self._setpoint_m
-            states.after(self._state_then, MOTIONS[name].event)
+            states.after(self._state_then, MOTIONS[name].event, name)
         if profile is None or holds_m is None:
-            raise RequestError(f"{name}: the stage is not connected; `stagectl status` says what it waits for")
+            raise _not_connected(name)
         return profile, holds_m
 
     def submit(self, name: str, body: Any, key: str, token: str, plan: plans.Plan | None = None) -> messages.Command:
@@ -426,7 +460,7 @@ class Desk:
             leases.holds(self._lease, token, self._clock_s())
             self._refuse_when_busy(name)
             if name in MOTIONS:
-                states.after(self._state_then, MOTIONS[name].event)
+                states.after(self._state_then, MOTIONS[name].event, name)
             self._check_values(name, body)
             order = Order(key, name, body, token, self._clock_s, plan)
             if name == "jogging":
@@ -461,6 +495,11 @@ class Desk:
         if self._own_is_under_way:
             return self._own_began_m
         return None if self._status is None else self._status.positions.setpoint_position_m
+
+    @property
+    def _homed_setpoint_m(self) -> float | None:
+        """Where the stage holds, from the homed zero; None where that is not known."""
+        return self._setpoint_m if self._status is not None and self._status.homed else None
 
     def begin_jog(self, body: messages.BeginJog, key: str, token: str) -> messages.Command:
         """Begin to jog, at rest, or brake the jog under way to go on with that. Errors: RequestError and kinds."""
@@ -542,10 +581,19 @@ class Desk:
             return
         low_m, high_m = profile.macro.travel_m
         travel = f"the travel of {profile.name} is [{low_m:g}, {high_m:g}] m"
-        if name == "move" and not low_m <= body.target_m <= high_m:
-            raise Unfit(f"target_m is {body.target_m:g}: {travel}; give a position within it")
+        for place, position_m in plans.positions(body).items():
+            if not low_m <= position_m <= high_m:
+                raise Unfit(f"{place} is {position_m:g}: {travel}; give a position within it")
         if name == "jog" and not abs(body.distance_m) <= high_m - low_m:
             raise Unfit(f"distance_m is {body.distance_m:g}: {travel}; give a distance within it")
+        holds_m = self._homed_setpoint_m
+        if name == "jog" and holds_m is not None:
+            reached_m, (lowest_m, highest_m) = holds_m + body.distance_m, travel_from(holds_m, profile)
+            if not lowest_m <= reached_m <= highest_m:
+                raise Unfit(
+                    f"distance_m is {body.distance_m:g}: from {holds_m:g} m that leads to {reached_m:g} m, {travel}; "
+                    "give a shorter distance"
+                )
         top = jog_velocity_m_per_s(profile)
         if name == "jog_at" and not abs(body.velocity_m_per_s) <= top:
             raise Unfit(f"velocity_m_per_s is {body.velocity_m_per_s:g}: a jog may do {top:g} m/s; ask for less")

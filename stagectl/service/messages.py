@@ -1,5 +1,6 @@
 """What goes over the API, both ways; the server checks it and the client has it as types. Units are in the names."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -10,6 +11,18 @@ LeaseKey = Annotated[Key, Field(min_length=16)]
 """Whoever says it again gets the lease: nothing to be guessed, or used twice by chance."""
 LawName = Literal["pid", "dsmc"]
 RunName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+
+
+_SHOWN_LETTERS = 60
+
+
+def sentence(problem: Mapping[str, Any]) -> str:
+    """Say what is wrong with one value of a request (an entry of pydantic's errors): place, value, limit."""
+    place = ".".join(str(part) for part in problem.get("loc", ()))
+    value = repr(problem.get("input"))
+    shown = value if len(value) <= _SHOWN_LETTERS else f"{value[:_SHOWN_LETTERS]}..."
+    text = f"{place} is {shown}: {problem.get('msg', 'is wrong')}"
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 class _Asked(BaseModel):

@@ -1,9 +1,12 @@
 """Where the service listens: a Unix socket for this machine's users, TCP on loopback only when asked for."""
 
+import contextlib
 import errno
+import fcntl
 import os
 import socket
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 from stagectl.errors import LinkError, RequestError
@@ -55,15 +58,16 @@ def listen_unix(path: Path) -> socket.socket:
         found = path.parent.stat()
         if found.st_uid not in (0, os.getuid()) or (found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX):
             raise LinkError(f"{path.parent}: others may put a socket of theirs here; give another path with --socket")
-        if is_served(path):
-            raise LinkError(f"{path}: a service listens here already; stop it, or give another path with --socket")
-        _remove_dead(path)
-        before = os.umask(0o777 & ~SOCKET_MODE)
-        try:
-            listening.bind(str(path))
-        finally:
-            os.umask(before)
-        listening.listen(_BACKLOG)
+        with _alone(path.parent):  # or two that begin at once take each other's socket for a dead one's
+            if is_served(path):
+                raise LinkError(f"{path}: a service listens here already; stop it, or give another path with --socket")
+            _remove_dead(path)
+            before = os.umask(0o777 & ~SOCKET_MODE)
+            try:
+                listening.bind(str(path))
+            finally:
+                os.umask(before)
+            listening.listen(_BACKLOG)
     except OSError as error:
         listening.close()
         raise LinkError(f"{path}: can't listen: {error.strerror or error}; give another path with --socket") from error
@@ -71,6 +75,17 @@ def listen_unix(path: Path) -> socket.socket:
         listening.close()
         raise
     return listening
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keep others that do the same out, until the end of the context."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _remove_dead(path: Path) -> None:

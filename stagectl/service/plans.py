@@ -34,6 +34,25 @@ def kept(body: BaseModel) -> BaseModel:
     return body
 
 
+def positions(body: BaseModel) -> dict[str, float]:
+    """Return the positions that a request names itself, each by its place, m."""
+    if isinstance(body, messages.Move):
+        return {"target_m": body.target_m}
+    if isinstance(body, messages.Scan):
+        start = {} if body.start_m is None else {"start_m": body.start_m}
+        return {**start, **{f"segments.{k}.target_m": part.target_m for k, part in enumerate(body.segments)}}
+    return {}
+
+
+def planned(body: BaseModel, profile: Profile, holds_m: float) -> Plan | None:
+    """Plan what begins where the stage holds; None for a motion that needs no plan. Errors: RequestError."""
+    if isinstance(body, messages.Scan):
+        return scanned(body, profile, holds_m)
+    if isinstance(body, messages.Follow):
+        return followed(body, profile)
+    return None
+
+
 def scanned(body: messages.Scan, profile: Profile, holds_m: float) -> Plan:
     """Plan a scan program. Errors: RequestError with segment or instant, value, limit, remedy."""
     limits = planned_limits(profile)

@@ -82,13 +82,13 @@ _REMEDY = {
 }
 
 
-def after(state: State, event: Event) -> State:
-    """Return the state that an event leads to; RequestError where there is no such transition."""
+def after(state: State, event: Event, asked: str = "") -> State:
+    """Return the state that an event leads to; RequestError, naming what was `asked` for, where there is none."""
     found = TRANSITIONS.get((state, event))
     if found is None:
         possible = ", ".join(sorted(one for at, one in TRANSITIONS if at is state))
         remedy = _REMEDY[state] or f"possible are {possible}"
-        raise RequestError(f"{event} is not possible in state {state}: {remedy}")
+        raise RequestError(f"{asked or event} is not possible in state {state}: {remedy}")
     return found
 
 

@@ -237,6 +237,24 @@ def test_keys_end_with_the_fault_that_takes_the_stage_away(idle):
     idle.recovers()
 
 
+def test_a_held_key_ends_with_the_fault_that_takes_the_stage_away(idle):
+    leader, jogging = armed_keys_jog(idle)
+    try:
+        until_s = time.monotonic() + 30.0
+        killed = False
+        while jogging.poll() is None and time.monotonic() < until_s:
+            os.write(leader, LEFT)
+            time.sleep(0.05)
+            if not killed and idle.client.status().state == "moving":
+                os.kill(servo_pid(idle), signal.SIGKILL)
+                killed = True
+        assert (killed, jogging.poll()) == (True, 3), jogging.stderr.read()
+    finally:
+        end(leader, jogging)
+    idle.state_is("fault")
+    idle.recovers()
+
+
 def test_what_was_typed_while_a_request_was_under_way_is_held_no_more():
     """Taken for keys held now, repeats of a key let go of 0.5 s before set the stage off for another 0.6 s."""
     hand = Hand(0.01, 0.03)

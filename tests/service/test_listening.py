@@ -42,6 +42,27 @@ def test_the_socket_is_for_owner_and_group(tmp_path):
     listen_unix(path).close()  # a dead service's socket is no obstacle
 
 
+def test_of_services_that_begin_at_once_one_has_the_socket(tmp_path):
+    """Between the look whether one listens and the listening itself another's new socket was taken for a dead one's."""
+    path = tmp_path / "run" / "stage.socket"
+    for _ in range(100):
+        together, had = threading.Barrier(4), []
+
+        def begin(together=together, had=had):
+            together.wait()
+            with contextlib.suppress(LinkError):
+                had.append(listen_unix(path))
+
+        threads = [threading.Thread(target=begin) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        for listening in had:
+            listening.close()
+        assert len(had) == 1
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
 def test_a_socket_in_a_folder_that_is_not_for_us_is_served(tmp_path):
     path = tmp_path / "run" / "stage.socket"
@@ -244,6 +265,42 @@ def test_no_body_in_pieces_gets_as_far_as_the_application(tmp_path, length):
     finally:
         listener.close()
     assert sum(taken_bytes) == 0
+
+
+@pytest.mark.parametrize("piece", [b"zz\r\nabc", b"5\r\nabcdefgh\r\n"])
+@pytest.mark.parametrize("when", ["with its head", "behind the refusal"])
+def test_a_broken_piece_ends_the_connection_and_nothing_else(tmp_path, caplog, piece, when):
+    """h11 raised at a second answer, here from uvicorn and there from the application: a traceback in the journal."""
+
+    async def answering(scope, receive, send):
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"0")]})
+        await send({"type": "http.response.body", "body": b""})
+
+    listener = Listener([(listen_unix(tmp_path / "s"), Access(answering, None))])
+    listener.start()
+    head = b"PUT /v1/lease HTTP/1.1\r\nHost: s\r\nTransfer-Encoding: chunked\r\n\r\n"
+    try:
+        with socket.socket(socket.AF_UNIX) as one:
+            one.settimeout(10.0)
+            one.connect(str(tmp_path / "s"))
+            if when == "with its head":
+                one.sendall(head + piece)
+                code, answer = b"400", one.recv(4096)
+            else:
+                one.sendall(head)
+                code, answer = b"411", one.recv(4096)
+                one.sendall(piece)
+            assert answer.startswith(b"HTTP/1.1 " + code)
+            while one.recv(4096):  # until it is closed
+                pass
+        with socket.socket(socket.AF_UNIX) as other:
+            other.settimeout(10.0)
+            other.connect(str(tmp_path / "s"))
+            other.sendall(b"GET /v1/lease HTTP/1.1\r\nHost: s\r\n\r\n")
+            assert other.recv(4096).startswith(b"HTTP/1.1 200")
+    finally:
+        listener.close()
+    assert [one for one in caplog.records if one.levelname == "ERROR"] == []
 
 
 class Crowd:

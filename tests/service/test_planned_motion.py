@@ -91,7 +91,11 @@ def test_a_scan_repeats_passes_and_dwells(armed):
 
 def test_a_scan_that_is_none_is_refused_before_anything_moves(armed):
     for body, text in (
-        (messages.Scan(segments=[GO(target_m=0.1), GO(target_m=0.5)]), r"'scan' at .* s: position_m is .*travel"),
+        (messages.Scan(segments=[GO(target_m=0.1), GO(target_m=0.5)]), r"segments\.1\.target_m is 0\.5: the travel"),
+        (
+            messages.Scan(segments=[GO(target_m=0.149, pass_velocity_m_per_s=0.2), GO(target_m=0.1)]),
+            r"'scan' at .* s: position_m is .*travel",
+        ),
         (messages.Scan(segments=[GO(target_m=0.1, velocity_m_per_s=19.0)]), r"segments\[0\].velocity_m_per_s is 19"),
         (
             messages.Scan(segments=[GO(target_m=0.1, dwell_s=3600.0)]),
@@ -104,6 +108,34 @@ def test_a_scan_that_is_none_is_refused_before_anything_moves(armed):
         armed.desk.submit_planned("scan", messages.Scan(segments=[GO(target_m=0.1)]), "refused", "guessed")
     armed.loop.step()
     assert np.all(reference(armed)["setpoint_position_m"] == 0.0)
+
+
+def test_a_question_begins_nothing_and_needs_no_lease(armed):
+    """Whoever must home and arm first asks before; a refusal behind that has moved the stage for nothing."""
+    with armed.desk._lock:
+        known = armed.desk.command("asked")
+    for name, body, text in (
+        ("move", messages.Move(target_m=0.16), r"target_m is 0.16: the travel of .* is \[-0.15, 0.15\] m; give"),
+        ("jog", messages.JogBy(distance_m=0.16), r"distance_m is 0.16: from 0 m that leads to 0.16 m, the travel"),
+        ("jog", messages.JogBy(distance_m=-0.31), r"distance_m is -0.31: the travel of"),
+        ("scan", messages.Scan(segments=[GO(target_m=0.1)], start_m=0.5), "start_m is 0.5: the travel"),
+        ("scan", messages.Scan(segments=[GO(target_m=0.1, velocity_m_per_s=19.0)]), r"velocity_m_per_s is 19"),
+        ("follow", messages.Follow(text=table(0.5)), "beyond the travel|position_m is"),
+        ("follow", messages.Follow(text="t,x"), "it must be 't_s,position_m'"),
+    ):
+        with pytest.raises(Unfit, match=text):
+            armed.desk.check(name, body)
+    for name, body in (
+        ("move", messages.Move(target_m=0.15)),
+        ("jog", messages.JogBy(distance_m=-0.15)),
+        ("scan", messages.Scan(segments=[GO(target_m=0.1)], start_m=0.05)),
+        ("follow", messages.Follow(text=table(0.02))),
+    ):
+        armed.desk.check(name, body)
+    assert known is None
+    armed.loop.step()
+    assert np.all(reference(armed)["setpoint_position_m"] == 0.0)
+    assert armed.status.state == "armed"
 
 
 def test_the_same_key_is_the_same_scan(armed):

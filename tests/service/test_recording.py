@@ -465,6 +465,8 @@ def test_a_session_that_is_recorded_always_is_one_run_and_stops_or_goes_on_as_th
         made.loop.step()
         (folder,) = disk.glob("*-service-always")
         assert (made.status.recording.trigger, made.status.recording.run) == ("always", folder.name)
+        with pytest.raises(Busy, match=f"name mine: {folder.name} is under way, begun by always; it has the rows"):
+            made.desk.ask_to_record("mine")
         made.take()
         assert made.do("home", messages.Home()).stop == "FINISHED"
         room = os.statvfs(disk)

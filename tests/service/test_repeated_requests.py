@@ -125,7 +125,7 @@ def test_a_caller_who_lost_every_answer_asks_again_with_his_own_key(idle, losing
         client.begin("jog", messages.JogBy(distance_m=2.0 * STEP_M), "mine")
 
 
-WATCHING = {"close", "command", "fault", "lease_state", "log", "metrics", "runs", "status", "stream_state"}
+WATCHING = {"check", "close", "command", "fault", "lease_state", "log", "metrics", "runs", "status", "stream_state"}
 BY_OTHER_MEANS = {"lease", "do"}  # made of others that stand here
 COMMANDS = {
     "take_lease": lambda client: client.take_lease("anna"),

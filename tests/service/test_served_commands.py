@@ -14,7 +14,7 @@ import pytest
 from stagectl import cli
 from stagectl.client import Client
 from stagectl.commands.answer import INTERRUPTED
-from stagectl.errors import RequestError, StagectlError
+from stagectl.errors import LinkError, RequestError, StagectlError
 from stagectl.record import read_manifest
 from stagectl.service import messages
 from tests.service.served import PATIENCE_S, Served
@@ -164,9 +164,8 @@ def test_watch_looks_as_often_as_it_is_told(call):
     for look in looks:
         assert messages.Status.model_validate_json(look).banner == BANNER
     assert json.loads("\n".join(end)) == {"command": "watch", "exit_code": 0, "looks_count": 3}
-    code, out, err = call("watch", "--count", 1)
-    assert code == 0
-    assert BANNER in out + err
+    code, out, _ = call("watch", "--count", 2)  # into a pipe: each look, and when it is had
+    assert (code, out.count(BANNER)) == (0, 2)
 
 
 def test_ctrl_c_ends_the_watching_and_nothing_else(idle, call):
@@ -301,12 +300,17 @@ def test_a_lease_that_is_lost_ends_the_holding(idle, call):
 # ---- what is refused before anything has power ---------------------------------------------------------------------
 
 
-def test_what_lies_beyond_the_travel_gives_nothing_power(idle, ask, tmp_path, monkeypatch):
+def test_what_lies_beyond_the_travel_gives_nothing_power(idle, call, ask, tmp_path, monkeypatch):
     """Told by the service after it had armed, it had homed a stage for a target that it can't go to."""
     program = tmp_path / "far.toml"
     program.write_text("start_m = 0\n[[segments]]\ntarget_m = 0.01\n[[segments]]\ntarget_m = 3.0\n")
+    table = tmp_path / "far.csv"
+    table.write_text("t_s,position_m\n0,0\n5,0.2\n10,0.6\n")
+    assert call("move", "--target-m", 0.05)[0] == 0
     before = len(idle.client.log(limit=1000))
     for arguments, lines, said in (
+        (("follow", table), "", "s: position_m is 0.4"),
+        (("jog", "--distance-m", 0.42), "", "m that leads to 0.47"),
         (("move", "--target-m", 5), "", "target_m is 5: the travel of oled-printer is [-0.45, 0.45] m"),
         (("jog", "--distance-m", 5), "", "distance_m is 5: the travel"),
         (("scan", program), "", "segments.1.target_m is 3: the travel"),
@@ -334,6 +338,24 @@ def test_a_lease_that_is_no_token_is_refused_and_stops_all_the_same(ask, lease):
     assert ask("stop")[0] == 0
 
 
+@pytest.mark.parametrize("forbidden", ["socket", "folder"])
+def test_a_socket_that_is_not_for_this_user_is_told_as_that(idle, tmp_path, forbidden):
+    folder = tmp_path / "closed"
+    folder.mkdir()
+    (folder / "stage.socket").symlink_to(idle.socket)
+    place, me = {"socket": idle.socket, "folder": folder}[forbidden], os.geteuid()
+    mode = place.stat().st_mode
+    place.chmod(0)
+    if me == 0:
+        os.seteuid(65534)  # root is refused nothing
+    try:
+        with Client(folder / "stage.socket") as client, pytest.raises(LinkError, match="is not for this user; join"):
+            client.status()
+    finally:
+        os.seteuid(me)
+        place.chmod(mode)
+
+
 def test_a_stop_needs_no_token(idle):
     with Client(idle.socket) as client:
         client.lease_token = "é"
@@ -354,7 +376,7 @@ def test_a_run_is_begun_shown_and_ended(idle, call, ask):
     assert run.endswith("-service-warm-up")
     assert call("record")[1] == f"{run}, begun by request\n"
     code, answer, _ = ask("record", "--name", "another")  # one at a time
-    assert (code, f"--name another: {run} is under way, begun by request; end it" in answer["error"]["message"]) == (
+    assert (code, f"name another: {run} is under way, begun by request; end that" in answer["error"]["message"]) == (
         2,
         True,
     )
@@ -364,6 +386,18 @@ def test_a_run_is_begun_shown_and_ended(idle, call, ask):
     assert (manifest["record"]["state"], manifest["end"]["stop"]) == ("closed", "OPERATOR")
     assert manifest["record"]["rows_count"] > 0
     assert call("record", "--end")[0] == 0
+
+
+def test_a_run_asked_for_under_a_motion_s_begins_behind_it(idle, ask):
+    with idle.client.lease("anna", 30.0):
+        idle.client.arm()
+        idle.until(lambda: idle.desk.status().recording.trigger == "arm")
+        code, answer, err = ask("record", "--name", "later")
+        assert (code, answer["recording"]["trigger"]) == (0, "arm")
+        assert "later begins when the motion's run ends" in err
+    idle.until(lambda: idle.desk.status().recording.trigger == "request")
+    assert idle.desk.status().recording.run.endswith("-service-later")
+    assert ask("record", "--end")[0] == 0
 
 
 def test_a_run_that_the_disk_refuses_is_no_success(idle, ask):
@@ -392,6 +426,9 @@ def test_what_can_t_be_recorded_is_refused_with_its_option(ask):
         (("trigger", "--error-m", "nan"), "--error-m is nan"),
         (("trigger", "--error-m", -1), "--error-m is -1"),
         (("trigger", "--reversal", "--before-s", -1), "--before-s is -1"),
+        (("trigger", "--count", 3), "--count is of an event that is not given"),
+        (("trigger", "--after-s", 3), "--after-s is of an event that is not given"),
+        (("trigger", "--end", "--count", 3), "--end and an event are both given"),
         (("trigger", "--reversal", "--before-s", 500), "record.flight_s keeps 30 s; ask for less, or raise it"),
     ):
         code, answer, _ = ask(*arguments)

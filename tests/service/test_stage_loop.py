@@ -154,9 +154,13 @@ def test_moves_hold_and_are_refused_where_they_must(armed):
         armed.begin("identify", messages.Identify())
     with pytest.raises(RequestError, match="arm is not possible in state armed: possible are"):
         armed.begin("arm", messages.Arm())
-    failed = armed.do("jog", messages.JogBy(distance_m=0.9 * armed.desk.profile.macro.travel_m[1] * 2))
+    with pytest.raises(
+        Unfit, match=r"distance_m is 0.27: from -0.01 m that leads to 0.26 m, the travel of single-axis"
+    ):
+        armed.begin("jog", messages.JogBy(distance_m=0.27))
+    failed = armed.do("reread", messages.Home())
     assert failed.state == "failed"
-    assert "the travel" in failed.error.message
+    assert "without power only; the state is armed" in failed.error.message
     assert armed.status.state == "armed"
 
 
@@ -170,14 +174,14 @@ def test_whoever_hears_of_an_end_sees_the_state_that_it_left(armed, monkeypatch)
 
     monkeypatch.setattr(Order, "_change", heard)
     armed.do("move", messages.Move(target_m=0.004))
-    armed.do("jog", messages.JogBy(distance_m=0.9 * armed.desk.profile.macro.travel_m[1] * 2))
+    armed.do("reread", messages.Home())
     armed.desk.ask_to_stop("enough")
     armed.until(lambda: armed.status.state == "idle")
     armed.do("arm", messages.Arm())
     armed.do("acknowledge", messages.Acknowledge(number=1))
     armed.inject(Fault("emergency", node_id=1, code=ENCODER_FAULT))
     armed.do("move", messages.Move(target_m=-0.004))
-    left = [(name, "armed", "armed") for name in ("move", "jog", "arm", "acknowledge")]
+    left = [(name, "armed", "armed") for name in ("move", "reread", "arm", "acknowledge")]
     assert seen == [*left, ("move", "fault", "fault")]
 
 
