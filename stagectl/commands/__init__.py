@@ -20,11 +20,13 @@ if TYPE_CHECKING:
         planned_motion,
         planning,
         profiles,
+        recording,
         remote,
         reproduce,
         runs,
         serve,
         tune,
+        watching,
     )
 
 __all__ = [
@@ -39,11 +41,13 @@ __all__ = [
     "planned_motion",
     "planning",
     "profiles",
+    "recording",
     "remote",
     "reproduce",
     "runs",
     "serve",
     "tune",
+    "watching",
 ]
 
 

@@ -81,13 +81,13 @@ def serve(
 @service_app.command(epilog=epilog("stagectl status", "stagectl status --json"))
 def status(socket: Socket = None, json: Json = False) -> None:
     """Show where the service's stage stands: state, fault, positions, lease, cycles."""
-    deliver("status", json, lambda voice: commands.remote.status(voice, socket), compiles=False)
+    deliver("status", json, lambda voice: commands.watching.status(voice, socket), compiles=False)
 
 
 @service_app.command(epilog=epilog("stagectl watch", "stagectl watch --json --count 10"))
 def watch(count: LooksCount = None, socket: Socket = None, json: Json = False) -> None:
     """Show the status again and again; with --json one object a line before the last."""
-    deliver("watch", json, lambda voice: commands.remote.watch(voice, socket, json, count), compiles=False)
+    deliver("watch", json, lambda voice: commands.watching.watch(voice, socket, json, count), compiles=False)
 
 
 @service_app.command(epilog=epilog("stagectl page", "stagectl page --port 8702 --runs /var/lib/stagectl/runs"))
@@ -131,7 +131,7 @@ def backend(world: World = None, lease: LeaseToken = None, socket: Socket = None
 @service_app.command(epilog=epilog("stagectl record", "stagectl record --name warm-up", "stagectl record --end"))
 def record(name: RecordName = None, end: EndRecord = False, socket: Socket = None, json: Json = False) -> None:
     """Show what the service records, begin a run, or end it; powered motions are recorded without asking."""
-    deliver("record", json, lambda voice: commands.remote.record(voice, socket, name, end), compiles=False)
+    deliver("record", json, lambda voice: commands.recording.record(voice, socket, name, end), compiles=False)
 
 
 @service_app.command(
@@ -152,13 +152,15 @@ def trigger(
     given = {"error_m": error_m, "contact_force_n": contact_force_n}
     given |= {"before_s": before_s, "after_s": after_s, "count": count}
     asked = {name: value for name, value in given.items() if value is not None}
-    deliver("trigger", json, lambda voice: commands.remote.trigger(voice, socket, asked, reversal, end), compiles=False)
+    deliver(
+        "trigger", json, lambda voice: commands.recording.trigger(voice, socket, asked, reversal, end), compiles=False
+    )
 
 
 @service_app.command(epilog=epilog("stagectl log --lines 50"))
 def log(lines: LinesCount = 30, socket: Socket = None, json: Json = False) -> None:
     """Show what the service did last."""
-    deliver("log", json, lambda voice: commands.remote.log(voice, socket, lines), compiles=False)
+    deliver("log", json, lambda voice: commands.watching.log(voice, socket, lines), compiles=False)
 
 
 @service_app.command(epilog=epilog("stagectl scan raster.toml"))

@@ -4,7 +4,7 @@ import io
 
 from rich.console import Console
 
-from stagectl.commands.remote import status_table
+from stagectl.commands.watching import status_table
 from stagectl.service import messages
 
 AT = "2026-05-04T03:02:01Z"

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from sim_backend.faults import Fault
-from stagectl.commands.remote import status_table
+from stagectl.commands.watching import status_table
 from stagectl.profile import PROFILES_FOLDER
 from stagectl.service import messages
 from stagectl.temperatures import UNREAD, WARNING
