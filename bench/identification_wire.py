@@ -15,11 +15,10 @@ import numpy as np
 from bench import identifying, variants
 from bench.figure import Bar, Figure, judged
 from sim_backend.machine import Machine, load_machine
-from stagectl import backlash, batch, tick
+from stagectl import backlash, batch, tick, touch_sweep
 from stagectl.laws.reference import gap_centre
 from stagectl.profile import Profile, load_profile
 from stagectl.signals import SETPOINT, Stop
-from stagectl.value_seam_run import sweep_setpoints
 
 SEAM_COVERED = Bar(
     "identification in closed loop, 100 nm, 8 % late lines: 95 % intervals that hold the truth", "%", 90.0, True
@@ -90,7 +89,7 @@ def _pulls(profile: Profile, machine: Machine, seed: int) -> tuple[float, ...]:
     joint = machine.backlash
     if joint is None:
         raise RuntimeError(f"{_STAGE}: no joint in the machine")
-    setpoints = sweep_setpoints(profile, _SHARE, _FREQUENCY_HZ, _DURATION_S, _FREQUENCY_HZ)
+    setpoints = touch_sweep.planned(profile, _SHARE, _FREQUENCY_HZ, _DURATION_S, _FREQUENCY_HZ).setpoints
     controller = tick.controller(profile, profile.control.law, has_drives=False)
     delay_s = profile.cycle.actuation_delay_s
     simulation = batch.simulation(controller, machine, latch_delay_s=delay_s, seed=seed)

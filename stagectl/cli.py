@@ -320,10 +320,14 @@ def jog(
     """Arm, home where needed, move by a distance or while a key is held, come to rest."""
     if (distance_m is None) is not keys:
         raise typer.BadParameter("give --distance-m, or --keys", ctx=context)
+    if keys and (in_place or law is not None):
+        raise typer.BadParameter(
+            "--keys jogs the service's stage under its own law, not --in-place or --law", ctx=context
+        )
 
     def work(voice: "Voice") -> "Answer":
         if distance_m is None:
-            return commands.jog_keys.jog(voice, socket, lease, velocity_m_per_s)
+            return commands.jog_keys.jog(voice, socket, lease, profile, _PROFILE, backend, velocity_m_per_s)
         if commands.remote.served(socket, lease, in_place):
             body = commands.remote.checked(commands.remote.messages.JogBy, distance_m=distance_m, law=law)
             return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "jog", body)

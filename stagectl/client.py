@@ -303,7 +303,10 @@ class Client:
         return messages.Command.model_validate(self._once("POST", f"/v1/{name}", body, key))
 
     def check(self, name: str, body: BaseModel) -> None:
-        """Ask whether the stage could do a motion, before it is homed and armed for it. RequestError where it can't."""
+        """Ask under the lease whether the stage could do a motion, before it is homed and armed for it.
+
+        RequestError where it can't.
+        """
         self._again(_KEYED_TRIES, "POST", f"/v1/check/{name}", body)
 
     def command(self, key: str, wait_s: float = 0.0) -> messages.Command:

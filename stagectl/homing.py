@@ -6,25 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from drivers import cia402
-from stagectl import trajectory as trajectories
-from stagectl.backlash import HOLD_RATIO, filter_time_s
+from stagectl import touch_sweep
 from stagectl.errors import DriveError, LinkError, RequestError
 from stagectl.outcome import BacklashEstimate, Outcome
-from stagectl.profile import MacroAxis, MicroAxis
 from stagectl.requests import Mode, Phase
 from stagectl.session import WATCHED_ONLY
 from stagectl.signals import Stop, stop_sentence
 from stagectl.stream_motion import StreamMotion
-from stagectl.touch_sweep import (
-    IDENTIFY_HZ,
-    IDENTIFY_SHARE,
-    TOUCH_HZ,
-    TOUCH_S,
-    TOUCH_SHARE,
-    Joint,
-    contact_damping_n_s_per_m,
-    plan,
-)
+from stagectl.touch_sweep import IDENTIFY_HZ, IDENTIFY_SHARE, TOUCH_HZ, TOUCH_S, TOUCH_SHARE
 
 _INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
 _TOUCH_TRIES = 4
@@ -261,40 +250,19 @@ class Homing(StreamMotion):
     def sweep(
         self, force_share: float, usual_hz: float, duration_s: float, name: str, asked_hz: float | None = None
     ) -> Outcome:
-        """Let the micro meet both edges, as `stagectl.touch_sweep.plan` has it for the joint that is believed now."""
+        """Let the micro meet both edges, as `stagectl.touch_sweep` has it for the joint that is believed now."""
         if self.profile.micro is None or self.profile.backlash is None:
             raise RequestError(f"{name}: this stage has no micro; there is no backlash to identify")
         status = self.status()
         self._centre(status)
-        joint = Joint(
-            damping_n_s_per_m=contact_damping_n_s_per_m(self.profile.effects),
-            touch_force_n=self.profile.backlash.touch_force_n,
-            hold_s=HOLD_RATIO * filter_time_s(self.profile),
-            **{name: float(self._belief[name][0]) for name in _JOINT},
-        )
-        planned = trajectories.sweep(
-            *plan(joint, force_share, usual_hz, duration_s, asked_hz),
-            centre_m=float(status["setpoint_position_m"]),
-            dt_s=1.0 / self.profile.cycle.rate_hz,
-        )
-        _check_sweep(planned, self.profile.macro, self.profile.micro)
+        believed = self.believed_backlash()
+        centre_m = float(status["setpoint_position_m"])
+        planned = touch_sweep.planned(self.profile, force_share, usual_hz, duration_s, asked_hz, believed, centre_m)
         return self.follow(planned.setpoints, name)
 
     def identify(self, frequency_hz: float | None = None, duration_s: float = 20.0) -> Outcome:
         """Identify the backlash from a sweep over both contacts; without a frequency, one that suits the joint."""
         return self.sweep(IDENTIFY_SHARE, IDENTIFY_HZ, duration_s, "identifying the backlash", frequency_hz)
-
-
-def _check_sweep(planned: trajectories.Trajectory, macro: MacroAxis, micro: MicroAxis) -> None:
-    """Refuse a sweep that the end can't follow; the macro stands, so its travel says nothing."""
-    trajectories.check(
-        planned,
-        (-math.inf, math.inf),
-        macro.velocity_limit_m_per_s,
-        macro.acceleration_limit_m_per_s2,
-        loads=(trajectories.Load("micro", micro.mass_kg, micro.force_limit_n, micro.damping_n_s_per_m),),
-        stroke_m=micro.stroke_m,
-    )
 
 
 def _refuse_no_joint(estimate: BacklashEstimate) -> None:

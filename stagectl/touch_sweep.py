@@ -10,7 +10,10 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+from stagectl import trajectory as trajectories
+from stagectl.backlash import HOLD_RATIO, filter_time_s
 from stagectl.errors import RequestError
+from stagectl.profile import Profile
 
 TOUCH_HZ, TOUCH_S, TOUCH_SHARE = 0.7, 6.0, 0.6
 """Homing's sweep where the joint allows it; the share of the touch force is low, for the edges are not known yet."""
@@ -41,6 +44,42 @@ class TouchSweep(NamedTuple):
     amplitude_m: float
     frequency_hz: float
     duration_s: float
+
+
+def planned(
+    profile: Profile,
+    force_share: float,
+    usual_hz: float,
+    duration_s: float,
+    asked_hz: float | None = None,
+    believed: Mapping[str, float] | None = None,
+    centre_m: float = 0.0,
+) -> trajectories.Trajectory:
+    """Plan a sweep as `plan` does, about where the macro stands, and check that the end can follow it.
+
+    `believed` are the edges and stiffnesses that are believed by now; the profile's without. Errors: RequestError.
+    """
+    backlash, micro, macro = profile.backlash, profile.micro, profile.macro
+    if backlash is None or micro is None:
+        raise RequestError(f"profile {profile.name}: this stage has no micro; there is no backlash to identify")
+    joint = Joint(
+        **(believed or {name: getattr(backlash, name) for name in Joint._fields[:4]}),
+        damping_n_s_per_m=contact_damping_n_s_per_m(profile.effects),
+        touch_force_n=backlash.touch_force_n,
+        hold_s=HOLD_RATIO * filter_time_s(profile),
+    )
+    swing = trajectories.sweep(
+        *plan(joint, force_share, usual_hz, duration_s, asked_hz), centre_m=centre_m, dt_s=profile.cycle.period_s
+    )
+    trajectories.check(
+        swing,
+        (-math.inf, math.inf),  # the macro stands, so its travel says nothing
+        macro.velocity_limit_m_per_s,
+        macro.acceleration_limit_m_per_s2,
+        loads=(trajectories.Load("micro", micro.mass_kg, micro.force_limit_n, micro.damping_n_s_per_m),),
+        stroke_m=micro.stroke_m,
+    )
+    return swing
 
 
 def contact_damping_n_s_per_m(effects: Iterable[Mapping[str, Any]]) -> float:
@@ -81,6 +120,11 @@ def plan(
             f"frequency_hz = {asked_hz:g}: with a gap of {2e3 * half_m:g} mm and {joint.damping_n_s_per_m:g} N s/m the "
             f"joint would be pressed harder than backlash.touch_force_n = {joint.touch_force_n:g} N; "
             f"ask for at most {math.floor(limit_hz * 1e3) * 1e-3:g} Hz"
+        )
+    if not duration_s >= 2.0 / asked_hz:
+        raise RequestError(
+            f"duration_s = {duration_s:g}: at {asked_hz:g} Hz the first and the last swing, the ramps, take "
+            f"{2.0 / asked_hz:g} s; give a longer duration_s, or a higher frequency_hz"
         )
     return TouchSweep(amplitude_m, asked_hz, duration_s)
 

@@ -4,7 +4,6 @@ Pure; knows no stage, no bus and no clock. Every derivative is the exact derivat
 """
 
 import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -246,7 +245,11 @@ def chain(
         planned = _planned_from(state, slower)
         planned.target_position = [_finite(f"segments[{i}].target_m", point.target_m)]
         planned.target_velocity = [_finite(f"segments[{i}].pass_velocity_m_per_s", point.pass_velocity_m_per_s)]
-        plan = _plan(planned, f"segments[{i}]: no way from {state} to {point}")
+        plan = _plan(
+            planned,
+            f"segments[{i}]: no way from {state.position_m:g} m at {state.velocity_m_per_s:g} m/s to "
+            f"{point.target_m:g} m at {point.pass_velocity_m_per_s:g} m/s with {point.velocity_m_per_s:g} m/s at most",
+        )
         knots_s, states = _planned_phases(plan, point.target_m)
         end_s = begin_s + float(knots_s[-1])
         moves = knots_s[-1] > 0.0
@@ -304,7 +307,7 @@ def _plan(planned: ruckig.InputParameter, refusal: str) -> ruckig.Trajectory:
     try:
         result = ruckig.Ruckig(1).calculate(planned, plan)
     except ruckig.RuckigError as error:
-        raise RequestError(f"{refusal}: {error}; widen the limits") from error
+        raise RequestError(f"{refusal}: ruckig finds none; widen the limits") from error
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise RequestError(f"{refusal}: {result}; widen the limits")
     return plan
@@ -364,7 +367,7 @@ def from_text(
     place = place or f"'{name}'"
     header = ["t_s", "position_m"]
     try:
-        rows = [row for row in csv.reader(io.StringIO(text.removeprefix("\ufeff"))) if row]
+        rows = [row for row in csv.reader(text.removeprefix("\ufeff").splitlines()) if row]
     except csv.Error as error:
         raise RequestError(f"trajectory {place}: {error}; give CSV with the header t_s,position_m") from error
     if not rows or [cell.strip() for cell in rows[0]] != header:

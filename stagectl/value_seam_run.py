@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sim_backend.machine import Machine
-from stagectl import backlash, batch, tick
+from stagectl import backlash, batch, tick, touch_sweep
 from stagectl.errors import RequestError
 from stagectl.laws.reference import gap_centre
 from stagectl.outcome import Outcome
@@ -23,17 +23,7 @@ from stagectl.row import new_rows
 from stagectl.run_scores import SWEEP_NAME, VALUE_SEAM, write_truth
 from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT, STOP_TEXT, Stop, stop_sentence
 from stagectl.stop_text import stop_detail
-from stagectl.touch_sweep import (
-    IDENTIFY_HZ,
-    IDENTIFY_SHARE,
-    TOUCH_HZ,
-    TOUCH_S,
-    TOUCH_SHARE,
-    Joint,
-    contact_damping_n_s_per_m,
-    plan,
-)
-from stagectl.trajectory import sweep
+from stagectl.touch_sweep import IDENTIFY_HZ, IDENTIFY_SHARE, TOUCH_HZ, TOUCH_S, TOUCH_SHARE
 
 _WARM_S = 1.0
 _EDGES = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
@@ -98,26 +88,6 @@ def simulate(
     return ended
 
 
-def sweep_setpoints(
-    profile: Profile, force_share: float, usual_hz: float, duration_s: float, asked_hz: float | None = None
-) -> np.ndarray:
-    """Plan a sweep of the micro over both edges, pressing with a share of the touch force."""
-    joint = profile.backlash
-    if joint is None:
-        raise RequestError(f"profile {profile.name}: this stage has no micro; there is no backlash to identify")
-    believed = Joint(
-        joint.left_m,
-        joint.right_m,
-        joint.left_stiffness_n_per_m,
-        joint.right_stiffness_n_per_m,
-        contact_damping_n_s_per_m(profile.effects),
-        joint.touch_force_n,
-        backlash.HOLD_RATIO * backlash.filter_time_s(profile),
-    )
-    planned = plan(believed, force_share, usual_hz, duration_s, asked_hz)
-    return sweep(*planned, dt_s=profile.cycle.period_s).setpoints
-
-
 def identify(
     profile: Profile,
     machine: Machine,
@@ -128,7 +98,7 @@ def identify(
     progress: Progress = lambda what, share: None,
 ) -> Outcome:
     """Home and identify the joint from a sweep over both edges; recorded like `simulate`."""
-    setpoints = sweep_setpoints(profile, IDENTIFY_SHARE, IDENTIFY_HZ, duration_s, frequency_hz)
+    setpoints = touch_sweep.planned(profile, IDENTIFY_SHARE, IDENTIFY_HZ, duration_s, frequency_hz).setpoints
     return simulate(profile, machine, setpoints, SWEEP_NAME, profile.control.law, folder, seed, progress)
 
 
@@ -156,7 +126,7 @@ def _home(profile: Profile, machine: Machine, law: str, seed: int) -> Homed:
     centre_m = float(gap_centre(believed[0]))
     start = Homed(0.0, {})
     simulation = _at_rest(profile, machine, law, seed, 0.0, start)
-    setpoints = sweep_setpoints(profile, TOUCH_SHARE, TOUCH_HZ, TOUCH_S)
+    setpoints = touch_sweep.planned(profile, TOUCH_SHARE, TOUCH_HZ, TOUCH_S).setpoints
     batch.run(simulation, _hold(setpoints, _WARM_S, profile.cycle.rate_hz))
     recording = batch.run(simulation, setpoints)
     found = simulation.controller.backlash

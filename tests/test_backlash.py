@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from stagectl import backlash, batch, edges, estimator, trajectory
-from stagectl.value_seam_run import sweep_setpoints
+from stagectl import backlash, batch, edges, estimator, touch_sweep, trajectory
 from tests.stage import exact, followed, simulated, with_values
 from tests.stage_loop import Loop
 
@@ -268,7 +267,7 @@ def test_followed_by_hand_is_followed_by_the_tick(oled_profile, oled_machine):
 
 def test_what_lines_bring_a_cycle_late_is_identified_with(oled_profile, oled_machine):
     """Three lines in ten are late, as they are behind a slow adapter: 0.4 nm, and 6.5 nm of what was predicted."""
-    setpoints = sweep_setpoints(oled_profile, 0.8, 1.0, 8.0, 1.0)
+    setpoints = touch_sweep.planned(oled_profile, 0.8, 1.0, 8.0, 1.0).setpoints
     edges_m = []
     for ratio in (0.0, 0.3):
         simulation = simulated(oled_profile, exact(oled_machine, oled_profile), "dsmc", seed=3)

@@ -459,3 +459,11 @@ def test_an_answer_that_no_disk_takes_is_told_as_that(more):
         process.stderr
         == "RecordError\nstdout: can't be written: No space left on device; what was to be said there is lost\n"
     )
+
+
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_an_answer_to_a_closed_output_is_told_as_that(more):
+    command = f'exec "{sys.executable}" -m stagectl.cli profile list {" ".join(more)} >&-'
+    process = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, text=True, timeout=60)
+    assert process.returncode == 5
+    assert process.stderr == "RecordError\nstdout: is closed; what was to be said there is lost\n"

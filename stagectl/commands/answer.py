@@ -106,6 +106,8 @@ def deliver(command: str, as_json: bool, work: Callable[[Voice], Answer], compil
 @contextlib.contextmanager
 def onto_stdout() -> Iterator[None]:
     """Turn what a full disk says into RecordError; a pipe that nobody reads any more ends the command quietly."""
+    if sys.stdout is None:
+        raise RecordError("stdout: is closed; what was to be said there is lost")
     try:
         yield
     except BrokenPipeError:
@@ -127,8 +129,8 @@ def _say_answer(command: str, as_json: bool, answer: Answer) -> None:
     if as_json:
         _print_json({"command": command, "exit_code": answer.exit_code, **answer.data})
         return
-    out = Console()
     with onto_stdout():
+        out = Console()
         for part in answer.shown:
             out.print(part, highlight=False, soft_wrap=isinstance(part, str))
 
@@ -143,9 +145,10 @@ def _say_where_compiled_code_goes(voice: Voice) -> None:
 def _print_json(value: dict[str, Any]) -> None:
     content = jsonable(value)
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
-    if codecs.lookup(sys.stdout.encoding or "ascii").name != "utf-8" or _has_raw_bytes(text):
-        text = json.dumps(content, indent=2, allow_nan=False)
-    say_line(text)
+    with onto_stdout():
+        if codecs.lookup(sys.stdout.encoding or "ascii").name != "utf-8" or _has_raw_bytes(text):
+            text = json.dumps(content, indent=2, allow_nan=False)
+        print(text, flush=True)
 
 
 def _has_raw_bytes(text: str) -> bool:

@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from stagectl.client import Client
 from stagectl.commands.answer import ENDED_EARLY, EXIT_CODES, Answer, Voice
-from stagectl.commands.remote import answered, connected, leased, prepared
+from stagectl.commands.remote import answered, connected, leased, prepared, refuse_other
 from stagectl.errors import JogOver, LinkError, RequestError
 from stagectl.service import messages
 
@@ -65,12 +65,21 @@ class Hand:
         return self._direction * self.speed_m_per_s if now_s < self._until_s else 0.0
 
 
-def jog(voice: Voice, socket: Path | None, token: str | None, speed_m_per_s: float) -> Answer:
+def jog(
+    voice: Voice,
+    socket: Path | None,
+    token: str | None,
+    profile: str,
+    usual_profile: str,
+    backend: str,
+    speed_m_per_s: float,
+) -> Answer:
     """Home where it is needed, arm, and follow the keys until q."""
     if not sys.stdin.isatty():
         raise RequestError("--keys needs a terminal to read keys from; give --distance-m instead")
     with connected(socket) as stage, leased(voice, stage, token):
         status = stage.status()
+        refuse_other(status, profile, usual_profile, backend)
         voice.note(status.banner)
         failed = prepared(voice, stage, status, "jog")
         if failed is not None:
@@ -107,10 +116,8 @@ def _follow_keys(voice: Voice, stage: Client, hand: Hand, fileno: int) -> messag
             found = stage.status()
             if found.state not in _HOLDS:
                 return found
-        if wanted != 0.0 and not key:
-            key = stage.begin_jog().key  # which may take its time: what the keys want is looked at again
-        elif wanted != 0.0 or was_moving:
-            key = _gone_on(stage, key, wanted)
+        if wanted != 0.0 or (was_moving and key):
+            key = _jogged(stage, key, wanted)
             if not key and (found := stage.status()).state not in _HOLDS:
                 return found
         was_moving = wanted != 0.0
@@ -126,11 +133,21 @@ def let_go_meanwhile(hand: Hand, fileno: int) -> None:
     hand.let_go()
 
 
-def _gone_on(stage: Client, key: str, wanted_m_per_s: float) -> str:
-    """Go on with a jog; returns its key, empty where it is over."""
+def _jogged(stage: Client, key: str, wanted_m_per_s: float) -> str:
+    """Begin a jog, or go on with it; returns its key, empty where it is over or the stage holds no more.
+
+    Beginning may take its time: what the keys want is looked at again before a velocity is said.
+    """
     try:
-        return stage.jog_at(key, wanted_m_per_s).key
+        return stage.jog_at(key, wanted_m_per_s).key if key else stage.begin_jog().key
     except JogOver:
+        return ""
+    except RequestError:
+        give_up_s = time.monotonic() + _LOOK_S
+        while stage.status().state in _HOLDS:  # somebody stops it, and that shows soon, or it is something else
+            if time.monotonic() > give_up_s:
+                raise
+            time.sleep(_STEP_S)
         return ""
 
 

@@ -48,11 +48,12 @@ def stream(voice: Voice, socket: Path | None, token: str | None, period_s: float
     first = next(positions, None)
     if first is None:
         raise RequestError("standard input is empty; give positions in metres, one a line")
+    beginning = remote.checked(messages.Setpoints, first_number=0, period_s=period_s, position_m=[first])
     with remote.connected(socket) as stage:
         status = stage.status()
-        stage.check("move", remote.checked(messages.Move, target_m=first))
         voice.note(f"{status.profile} through the service: {status.banner}")
         with remote.leased(voice, stage, token):
+            stage.check("setpoints", beginning)
             command = remote.prepared(voice, stage, status, "stream")
             if command is None:
                 command = stage.move(first)

@@ -13,7 +13,7 @@ from stagectl.commands.remote import checked, connected
 from stagectl.errors import RecordError, RequestError
 from stagectl.service import messages
 
-_MOTION = "arm"  # what a motion's run was begun by
+_MOTION, _REQUEST = "arm", "request"  # what a run was begun by
 _HEED_S, _LOOK_S = 3.0, 0.05
 
 
@@ -25,31 +25,44 @@ def record(voice: Voice, socket: Path | None, name: str | None, end: bool) -> An
         status = stage.status()
         if end:
             stage.end_record()
-            status = _once_heeded(stage, lambda found: found is None or found.trigger != "request")
+            status = _once_heeded(stage, lambda found: not (_is_on_request(found) or _is_to_come(found)))
         elif name is not None:
-            body = checked(messages.StartRecord, name=name)
             before = status.recording
-            stage.record(body.name)
-            status = _once_heeded(stage, lambda found: _is_begun(found, before))
-            if status.recording is None or not status.recording.run:
+            stage.record(checked(messages.StartRecord, name=name).name)
+            status = _once_heeded(
+                stage,
+                lambda found: _is_on_request(found) or _is_behind_motion(found) or _is_newly_refused(found, before),
+            )
+            if _is_behind_motion(status.recording):
+                voice.note(f"{name} begins when the motion's run ends")
+            elif not _is_on_request(status.recording):
                 trouble = "the stage is not connected" if status.recording is None else status.recording.trouble
                 raise RecordError(f"no run was begun: {trouble or f'not within {_HEED_S:g} s; see `stagectl log`'}")
-            if status.recording.trigger == _MOTION:
-                voice.note(f"{name} begins when the motion's run ends")
     voice.note(status.banner)
     found = status.recording
     text = "nothing: the stage is not connected"
     if found is not None:
         text = f"{found.run}, begun by {found.trigger}" if found.run else "the last seconds only, in memory"
+        text += f"; then {found.next_name}" if found.next_name else ""
     shown = [escape(text), *([f"[red]{escape(found.trouble)}[/]"] if found is not None and found.trouble else [])]
     return Answer({"recording": None if found is None else found.model_dump()}, shown)
 
 
-def _is_begun(found: messages.Recording | None, before: messages.Recording | None) -> bool:
-    """Tell whether a run is under way, or what is wrong is another thing than before."""
-    return found is not None and bool(
-        found.run or (found.trouble and (before is None or found.trouble != before.trouble))
-    )
+def _is_on_request(found: messages.Recording | None) -> bool:
+    return found is not None and found.run != "" and found.trigger == _REQUEST
+
+
+def _is_to_come(found: messages.Recording | None) -> bool:
+    return found is not None and found.next_name != ""
+
+
+def _is_behind_motion(found: messages.Recording | None) -> bool:
+    return found is not None and found.trigger == _MOTION and _is_to_come(found)
+
+
+def _is_newly_refused(found: messages.Recording | None, before: messages.Recording | None) -> bool:
+    """Tell whether the disk refuses something else than before."""
+    return found is not None and found.trouble not in ("", "" if before is None else before.trouble)
 
 
 def _once_heeded(stage: Client, heeded: Callable[[messages.Recording | None], bool]) -> messages.Status:
@@ -76,8 +89,9 @@ def trigger(voice: Voice, socket: Path | None, asked: dict[str, Any], reversal: 
             stage.end_trigger()
             status = _once_heeded(stage, lambda found: found is None or not found.waits_for)
         elif reversal or level:
+            before = "" if status.recording is None else status.recording.waits_for
             stage.set_trigger(checked(messages.SetTrigger, **asked))
-            status = _once_heeded(stage, lambda found: found is not None and bool(found.waits_for))
+            status = _once_heeded(stage, lambda found: found is not None and found.waits_for not in ("", before))
     voice.note(status.banner)
     found = status.recording
     waits_for = "" if found is None else found.waits_for

@@ -109,11 +109,11 @@ def motion(
     """Home where it is needed, arm, move; with a lease of our own the stage comes to rest without power."""
     with connected(socket) as stage:
         status = stage.status()
-        _refuse_other(status, profile, usual_profile, backend)
-        if name != "home":  # which is what the others may begin with
-            stage.check(name, body)
+        refuse_other(status, profile, usual_profile, backend)
         voice.note(f"{status.profile} through the service: {status.banner}")
         with leased(voice, stage, token):
+            if name != "home":  # which is what the others may begin with
+                stage.check(name, body)
             command = prepared(voice, stage, status, name)
             if command is None:
                 command = follow(voice, stage, name, body)
@@ -121,7 +121,7 @@ def motion(
     return answered(command, at_rest)
 
 
-def _refuse_other(status: messages.Status, profile: str, usual_profile: str, backend: str) -> None:
+def refuse_other(status: messages.Status, profile: str, usual_profile: str, backend: str) -> None:
     """Refuse options that mean another stage than the service has."""
     path = Path(profile)
     is_its_file = path.exists() and path.resolve() == Path(status.profile_path).resolve()

@@ -211,8 +211,8 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
     planner("follow", messages.Follow, "Follow a table of times and positions; checked before the first cycle.")
 
     def checker(name: str, model: type) -> None:
-        def check(body: Any) -> None:
-            desk.check(name, body)
+        def check(body: Any, token: LeaseToken = "") -> None:
+            desk.check(name, body, token)
 
         check.__annotations__["body"] = model
         check.__doc__ = (
@@ -227,6 +227,7 @@ def _command_routes(app: FastAPI, desk: Desk) -> None:
     checker("probe", messages.Probe)
     checker("scan", messages.Scan)
     checker("follow", messages.Follow)
+    checker("setpoints", messages.Setpoints)
 
     @app.get("/v1/setpoints")
     async def stream_state() -> messages.StreamState | None:

@@ -159,6 +159,9 @@ class Desk:
         self._stop_reason = ""
         self._stop = threading.Event()
         self._record_request: str | None = None
+        self._record_taken = False  # and the status does not show yet what became of it
+        self._plans = threading.Lock()
+        """One motion is planned at a time: a table of 60,000 rows takes a second of the processor."""
         self._trigger_request: messages.SetTrigger | str | None = None
         self._closed = False
         self._status: messages.Status | None = None
@@ -173,6 +176,7 @@ class Desk:
     def publish(self, status: messages.Status, state: State) -> None:
         """Put the newest status out."""
         self._status, self._state = status, state
+        self._record_taken = False
         if self._lease is not None and self._lease.released and not self.powered:
             with self._lock:
                 if self._lease is not None and self._lease.released:  # not one that was just taken
@@ -224,6 +228,7 @@ class Desk:
             return None
         with self._lock:
             asked, self._record_request = self._record_request, None
+            self._record_taken = True
             return asked
 
     def next_trigger_request(self) -> messages.SetTrigger | str | None:
@@ -325,7 +330,7 @@ class Desk:
             if self._used(key, "record", name) is not None:
                 return
             self._refuse_when_closed()
-            if self._record_request is not None:
+            if self._record_request is not None or self._record_taken:
                 raise Busy("another client asks the same just now; ask again")
             if self.profile is None:
                 raise Busy("there is nothing to record: the stage is not connected")
@@ -338,7 +343,13 @@ class Desk:
     def _refuse_second_run(self, name: str) -> None:
         """Refuse a run where one is under way that has the rows already; behind a motion's own it may begin. Busy."""
         under_way = None if self._status is None else self._status.recording
-        if under_way is None or not under_way.run or under_way.trigger == ARM:
+        if under_way is None:
+            return
+        if under_way.next_name:
+            raise Busy(
+                f"name {name}: {under_way.next_name} was asked for before, and is about to begin; it has the rows"
+            )
+        if not under_way.run or under_way.trigger == ARM:
             return
         remedy = (
             "end that first (`stagectl record --end`)" if under_way.trigger == REQUEST else "it has the rows already"
@@ -375,31 +386,33 @@ class Desk:
             waiting.fail(Busy(f"{waiting.name}: stopped before it began: {reason}"))
 
     def submit_planned(self, name: str, body: Any, key: str, token: str) -> messages.Command:
-        """Plan a scan or a table, check it, and take it over like `submit`; plans without the lock."""
-        with self._lock:
-            used = self._used(key, name, plans.kept(body))
-            if used is not None:
-                return used.answer.message()
-        profile, holds_m = self._where_it_holds(name, token)
-        self._check_values(name, body)
-        with _unfit():
-            plan = plans.planned(body, profile, holds_m)
-        return self.submit(name, plans.kept(body), key, token, plan)
+        """Plan a scan or a table, check it, and take it over like `submit`; plans without the desk's lock."""
+        with self._plans:
+            with self._lock:
+                used = self._used(key, name, plans.kept(body))
+                if used is not None:
+                    return used.answer.message()
+            profile, holds_m = self._where_it_holds(name, token)
+            self._check_values(name, body, self._homed_setpoint_m)
+            with _unfit():
+                plan = plans.planned(body, profile, holds_m)
+            return self.submit(name, plans.kept(body), key, token, plan)
 
-    def check(self, name: str, body: Any) -> None:
-        """Refuse a motion that this stage can't do, as submitting it would; begins nothing, and needs no lease.
+    def check(self, name: str, body: Any, token: str) -> None:
+        """Refuse a motion that this stage can't do, as submitting it would, and begin nothing.
 
-        For whoever must home and arm first: both are motion too. Where the stage is not homed yet it will hold at the
-        homed zero. Errors: RequestError, Unfit.
+        For whoever must home and arm first: both are motion too. Where the stage is not homed yet it will hold about
+        the homed zero. Errors: RequestError and kinds.
         """
         with self._lock:
             self._refuse_when_closed()
-            profile, holds_m = self.profile, self._homed_setpoint_m
+            leases.holds(self._lease, token, self._clock_s())
+            profile, holds_m = self.profile, self._homed_setpoint_m or 0.0
             if profile is None:
                 raise _not_connected(name)
-            self._check_values(name, body)
-        with _unfit():
-            plans.planned(body, profile, 0.0 if holds_m is None else holds_m)
+            self._check_values(name, body, holds_m)
+        with self._plans, _unfit():
+            plans.rehearse(body, profile, holds_m)
 
     def take_setpoints(self, body: messages.Setpoints, token: str, key: str = "") -> messages.StreamState:
         """Begin a stream, or take what goes on with it; `key` is the stream's, the same with each of its blocks.
@@ -461,7 +474,7 @@ class Desk:
             self._refuse_when_busy(name)
             if name in MOTIONS:
                 states.after(self._state_then, MOTIONS[name].event, name)
-            self._check_values(name, body)
+            self._check_values(name, body, self._homed_setpoint_m)
             order = Order(key, name, body, token, self._clock_s, plan)
             if name == "jogging":
                 order.hold(0.0, body.hold_s)
@@ -525,7 +538,7 @@ class Desk:
             under_way = order is not None and order.key == key and order.name == "jogging" and not order.over
             if order is None or not under_way or order.wanted_m_per_s() is None:
                 raise JogOver(f"the jog {key} is over: nothing was said in time, or it came to an end; begin a new one")
-            self._check_values("jog_at", body)
+            self._check_values("jog_at", body, None)
             order.hold(body.velocity_m_per_s, body.hold_s)
             return order.message()
 
@@ -574,8 +587,8 @@ class Desk:
         if self._current is not None and not self._current.over and not self._own_is_under_way:
             raise Busy(f"{name}: {self._current.name} is under way; wait for its end, or stop it")
 
-    def _check_values(self, name: str, body: Any) -> None:
-        """Refuse at once what this stage can never do. Errors: Unfit."""
+    def _check_values(self, name: str, body: Any, holds_m: float | None) -> None:
+        """Refuse at once what this stage can never do, or not from where it holds (from the homed zero). Unfit."""
         profile = self.profile
         if profile is None:
             return
@@ -583,10 +596,9 @@ class Desk:
         travel = f"the travel of {profile.name} is [{low_m:g}, {high_m:g}] m"
         for place, position_m in plans.positions(body).items():
             if not low_m <= position_m <= high_m:
-                raise Unfit(f"{place} is {position_m:g}: {travel}; give a position within it")
+                raise Unfit(f"{place} is {position_m:.15g}: {travel}; give a position within it")
         if name == "jog" and not abs(body.distance_m) <= high_m - low_m:
             raise Unfit(f"distance_m is {body.distance_m:g}: {travel}; give a distance within it")
-        holds_m = self._homed_setpoint_m
         if name == "jog" and holds_m is not None:
             reached_m, (lowest_m, highest_m) = holds_m + body.distance_m, travel_from(holds_m, profile)
             if not lowest_m <= reached_m <= highest_m:

@@ -31,10 +31,14 @@ class _Asked(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
+_PLAIN = r"^[^\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]+$"
+"""Text that does nothing to the terminal it is shown on: no control characters, and none that turn it about."""
+
+
 class TakeLease(_Asked):
     """Ask for the lease on motion."""
 
-    holder: Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f]+$")]
+    holder: Annotated[str, Field(min_length=1, max_length=100, pattern=_PLAIN)]
     duration_s: Annotated[Finite, Field(ge=0.2, le=30.0)] = 2.0
 
 
@@ -86,7 +90,7 @@ class Segment(_Asked):
     """One part of a scan: to a position, there at rest for `dwell_s`, or passing it without a stop."""
 
     target_m: Annotated[Finite, Field(ge=-100.0, le=100.0)]
-    velocity_m_per_s: Annotated[Finite, Field(gt=0.0, le=20.0)] | None = None
+    velocity_m_per_s: Annotated[Finite, Field(ge=1e-6, le=20.0)] | None = None
     """At most; without it, as fast as a move."""
     pass_velocity_m_per_s: Annotated[Finite, Field(ge=-20.0, le=20.0)] = 0.0
     """With which the target is passed, signed: the next segment goes on from there."""
@@ -285,6 +289,8 @@ class Recording(BaseModel):
     rows_count: int
     trouble: str
     """What the disk refuses; empty where all is well."""
+    next_name: str = ""
+    """Name of the run that was asked for and is about to begin, or begins when the motion's ends; empty where none."""
     waits_for: str = ""
     """The event that is waited for, and how often still; empty where none is."""
 

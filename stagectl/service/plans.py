@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
-from stagectl import scan, suspected_units
+from stagectl import scan, suspected_units, touch_sweep
 from stagectl import trajectory as trajectories
 from stagectl.backend import SEGMENT_ROWS
 from stagectl.errors import RequestError
@@ -41,6 +41,8 @@ def positions(body: BaseModel) -> dict[str, float]:
     if isinstance(body, messages.Scan):
         start = {} if body.start_m is None else {"start_m": body.start_m}
         return {**start, **{f"segments.{k}.target_m": part.target_m for k, part in enumerate(body.segments)}}
+    if isinstance(body, messages.Setpoints):
+        return {"position_m.0": body.position_m[0]}
     return {}
 
 
@@ -51,6 +53,25 @@ def planned(body: BaseModel, profile: Profile, holds_m: float) -> Plan | None:
     if isinstance(body, messages.Follow):
         return followed(body, profile)
     return None
+
+
+def rehearse(body: BaseModel, profile: Profile, holds_m: float) -> None:
+    """Plan what is planned only when it begins, too. Errors: RequestError.
+
+    A sweep goes by the joint that is believed then, here the profile's; a stream begins at its own first position.
+    """
+    if isinstance(body, messages.Identify):
+        touch_sweep.planned(
+            profile,
+            touch_sweep.IDENTIFY_SHARE,
+            touch_sweep.IDENTIFY_HZ,
+            body.duration_s,
+            body.frequency_hz,
+        )
+    elif isinstance(body, messages.Setpoints):
+        streamed(body, profile, body.position_m[0])
+    else:
+        planned(body, profile, holds_m)
 
 
 def scanned(body: messages.Scan, profile: Profile, holds_m: float) -> Plan:

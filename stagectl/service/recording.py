@@ -43,6 +43,7 @@ class Recording:
         self._watch: TriggerWatch | None = None
         self._left_count = 0
         self._name_after_motion = ""  # of the run that was asked for while a motion's was under way
+        self._name_asked = ""  # of the run that was asked for last
         self._window: tuple[int, int] | None = None  # rows of the session, the end of which is still to come
         self._unsaved: set[Path] = set()  # what a session left and nobody could save yet
 
@@ -110,6 +111,7 @@ class Recording:
         flight = self._recorder
         if flight is None:
             return
+        self._name_asked = name
         if flight.run_folder is None:
             flight.go_on_as(f"service-{name}", REQUEST)
             return
@@ -182,12 +184,13 @@ class Recording:
         flight = self._recorder
         if flight is None:
             return None
-        run = flight.run_folder
+        run, is_due = flight.run_folder, flight.trigger_soon == REQUEST != flight.trigger
         return messages.Recording(
             run="" if run is None else run.name,
             trigger=flight.trigger,
             rows_count=flight.run_rows_count,
             trouble=flight.trouble,
+            next_name=self._name_after_motion or (self._name_asked if is_due else ""),
             waits_for="" if self._watch is None else self._waits_for(self._watch),
         )
 

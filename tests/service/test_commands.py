@@ -177,10 +177,10 @@ def test_what_was_meant_for_a_service_that_is_gone_moves_nothing_else(named, com
     assert not (tmp_path / "runs").exists()
 
 
-def keys_jog(idle):
+def keys_jog(idle, *more):
     """Start `jog --keys` at a terminal of its own: (the terminal's other end, the process)."""
     leader, follower = pty.openpty()
-    command = [sys.executable, "-m", "stagectl.cli", "jog", "--keys", "--velocity-m-per-s", "0.02"]
+    command = [sys.executable, "-m", "stagectl.cli", "jog", "--keys", "--velocity-m-per-s", "0.02", *more]
     jogging = subprocess.Popen(
         [*command, "--socket", str(idle.socket)], stdin=follower, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     )
@@ -235,6 +235,47 @@ def test_keys_end_with_the_fault_that_takes_the_stage_away(idle):
         end(leader, jogging)
     idle.state_is("fault")
     idle.recovers()
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--profile", "kang-2023"], "--profile kang-2023: the service has"),
+        (["--backend", "hardware"], "--backend hardware: the service has rig"),
+        (["--velocity-m-per-s", "nan"], "Invalid value for '--velocity-m-per-s'"),
+        (["--in-place"], "not --in-place or --law"),
+        (["--law", "pid"], "not --in-place or --law"),
+    ],
+)
+def test_keys_of_another_stage_give_this_one_no_power(idle, more, said):
+    before = [entry.event for entry in idle.client.log(limit=1000)]
+    leader, jogging = keys_jog(idle, *more)
+    try:
+        assert jogging.wait(30.0) == 2
+        assert said in " ".join(jogging.stderr.read().decode().split())
+    finally:
+        end(leader, jogging)
+    after = [entry.event for entry in idle.client.log(limit=1000)]
+    assert [event for event in after if not event.startswith("lease")] == [
+        event for event in before if not event.startswith("lease")
+    ]
+
+
+def test_keys_end_where_somebody_stops_the_stage(idle):
+    leader, jogging = armed_keys_jog(idle)
+    try:
+        stopped, until_s = False, time.monotonic() + 30.0
+        while jogging.poll() is None and time.monotonic() < until_s:
+            os.write(leader, LEFT)
+            time.sleep(0.05)
+            if not stopped and idle.client.status().state == "moving":
+                idle.client.stop()
+                stopped = True
+        assert (stopped, jogging.poll()) == (True, 1)
+        assert "RequestError" not in jogging.stderr.read().decode()
+    finally:
+        end(leader, jogging)
+    idle.state_is("idle")
 
 
 def test_a_held_key_ends_with_the_fault_that_takes_the_stage_away(idle):

@@ -1,6 +1,8 @@
 """Scans, tables and streams through the service, in virtual time: refused before the first cycle, or followed."""
 
 import math
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -110,10 +112,8 @@ def test_a_scan_that_is_none_is_refused_before_anything_moves(armed):
     assert np.all(reference(armed)["setpoint_position_m"] == 0.0)
 
 
-def test_a_question_begins_nothing_and_needs_no_lease(armed):
+def test_a_question_begins_nothing(armed):
     """Whoever must home and arm first asks before; a refusal behind that has moved the stage for nothing."""
-    with armed.desk._lock:
-        known = armed.desk.command("asked")
     for name, body, text in (
         ("move", messages.Move(target_m=0.16), r"target_m is 0.16: the travel of .* is \[-0.15, 0.15\] m; give"),
         ("jog", messages.JogBy(distance_m=0.16), r"distance_m is 0.16: from 0 m that leads to 0.16 m, the travel"),
@@ -122,20 +122,48 @@ def test_a_question_begins_nothing_and_needs_no_lease(armed):
         ("scan", messages.Scan(segments=[GO(target_m=0.1, velocity_m_per_s=19.0)]), r"velocity_m_per_s is 19"),
         ("follow", messages.Follow(text=table(0.5)), "beyond the travel|position_m is"),
         ("follow", messages.Follow(text="t,x"), "it must be 't_s,position_m'"),
+        ("setpoints", messages.Setpoints(first_number=0, period_s=0.0105, position_m=[0.0]), "period_s is 0.0105"),
+        ("setpoints", messages.Setpoints(first_number=0, period_s=0.01, position_m=[0.2]), "position_m.0 is 0.2: the"),
     ):
         with pytest.raises(Unfit, match=text):
-            armed.desk.check(name, body)
+            armed.desk.check(name, body, armed.token)
     for name, body in (
         ("move", messages.Move(target_m=0.15)),
         ("jog", messages.JogBy(distance_m=-0.15)),
         ("scan", messages.Scan(segments=[GO(target_m=0.1)], start_m=0.05)),
         ("follow", messages.Follow(text=table(0.02))),
+        ("setpoints", messages.Setpoints(first_number=0, period_s=PERIOD_S, position_m=[0.1])),
     ):
-        armed.desk.check(name, body)
-    assert known is None
+        armed.desk.check(name, body, armed.token)
+        with pytest.raises(LeaseRefused):
+            armed.desk.check(name, body, "guessed")
     armed.loop.step()
     assert np.all(reference(armed)["setpoint_position_m"] == 0.0)
     assert armed.status.state == "armed"
+
+
+def test_motions_are_planned_one_at_a_time_and_a_key_once(armed):
+    """Many at once took the processor from the supervisor until its sign of life was missed."""
+    body = messages.Scan(segments=[GO(target_m=0.005), GO(target_m=0.0)])
+    found = []
+
+    def submit():
+        found.append(armed.desk.submit_planned("scan", body, "together", armed.token))
+
+    threads = [threading.Thread(target=submit) for _ in range(3)]
+    with armed.desk._plans:  # as while one is being planned
+        for thread in threads:
+            thread.start()
+        time.sleep(0.1)
+        assert (found, armed.desk.command("together")) == ([], None)
+        armed.desk.ask_to_stop("it is heard meanwhile")
+        armed.until(lambda: not armed.desk.stop_asked)
+        armed.until(lambda: armed.status.state == "idle")
+        assert armed.do("arm", messages.Arm()).stop == "FINISHED"
+    for thread in threads:
+        thread.join(60.0)
+    assert [one.key for one in found] == ["together"] * 3
+    armed.until(lambda: armed.desk.command("together").state == "done")
 
 
 def test_the_same_key_is_the_same_scan(armed):

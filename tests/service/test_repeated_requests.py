@@ -275,8 +275,7 @@ def test_who_waits_for_a_command_hears_its_end_whatever_keys_are_used_meanwhile(
     order.begin()
     one.desk.profile = load_profile("single-axis")
     for k in range(ANSWERS_COUNT + 1):
-        one.desk.ask_to_record("", f"r{k}")
-        one.desk.next_record_request()
+        one.desk.set_trigger(None, f"r{k}")
     assert one.desk.command("long").state == "running"
     with pytest.raises(Unfit, match="key 'long' was used more than 1000 keys ago"):
         one.jog("long")

@@ -307,21 +307,36 @@ def test_what_lies_beyond_the_travel_gives_nothing_power(idle, call, ask, tmp_pa
     table = tmp_path / "far.csv"
     table.write_text("t_s,position_m\n0,0\n5,0.2\n10,0.6\n")
     assert call("move", "--target-m", 0.05)[0] == 0
-    before = len(idle.client.log(limit=1000))
+    before = doings(idle)
     for arguments, lines, said in (
         (("follow", table), "", "s: position_m is 0.4"),
         (("jog", "--distance-m", 0.42), "", "m that leads to 0.47"),
         (("move", "--target-m", 5), "", "target_m is 5: the travel of oled-printer is [-0.45, 0.45] m"),
         (("jog", "--distance-m", 5), "", "distance_m is 5: the travel"),
         (("scan", program), "", "segments.1.target_m is 3: the travel"),
-        (("stream",), "1.0\n", "target_m is 1: the travel"),
+        (("stream",), "1.0\n", "position_m.0 is 1: the travel"),
+        (("stream", "--period-s", 0.0105), "0.0\n", "period_s is 0.0105: set-points come a whole number of cycles"),
+        (("identify", "--frequency-hz", 0.05, "--duration-s", 2), "", "take 40 s; give a longer duration_s"),
         (("stream",), "nan\n", "line 1 is 'nan'; give one position"),
         (("stream",), "1e999\n", "line 1 is '1e999'; give one position"),
     ):
         monkeypatch.setattr("sys.stdin", io.StringIO(lines))
         code, answer, _ = ask(*arguments)
         assert (code, said in answer["error"]["message"]) == (2, True), answer
-    assert len(idle.client.log(limit=1000)) == before
+    assert doings(idle) == before
+    idle.bench.loop._homed = False
+    try:
+        idle.until(lambda: not idle.desk.status().homed)
+        code, answer, _ = ask("jog", "--distance-m", 0.5)
+        assert (code, "from 0 m that leads to 0.5 m" in answer["error"]["message"]) == (2, True), answer
+        assert doings(idle) == before
+    finally:
+        idle.bench.loop._homed = True
+
+
+def doings(served):
+    """What the service has done that is more than giving a lease."""
+    return sum(not entry.event.startswith("lease") for entry in served.log.last(2000))
 
 
 def test_a_value_that_no_request_can_have_is_refused(idle):
@@ -329,6 +344,20 @@ def test_a_value_that_no_request_can_have_is_refused(idle):
         idle.client.move(math.nan)
     with pytest.raises(RequestError, match=r"position_m\.1 is inf"):
         idle.client.send_setpoints(0, 0.01, [0.0, math.inf])
+
+
+@pytest.mark.parametrize(
+    "strange", ["\x1b[31m", "\x9b31m", "\x9d0;title\x9c", "\u202ereversed", "two\u2028lines", "\x85"]
+)
+def test_no_holder_s_name_does_anything_to_a_terminal(idle, strange):
+    with pytest.raises(RequestError, match="holder is"):
+        idle.client.take_lease(f"anna {strange}")
+    assert idle.desk.lease_state() is None
+
+
+def test_a_holder_s_name_may_have_any_letters(idle):
+    with idle.client.lease("Anna Müller – 李@stage (pid 3)"):
+        assert idle.desk.lease_state().holder == "Anna Müller – 李@stage (pid 3)"
 
 
 @pytest.mark.parametrize("lease", ["é", "a\nb"])
@@ -393,10 +422,13 @@ def test_a_run_asked_for_under_a_motion_s_begins_behind_it(idle, ask):
         idle.client.arm()
         idle.until(lambda: idle.desk.status().recording.trigger == "arm")
         code, answer, err = ask("record", "--name", "later")
-        assert (code, answer["recording"]["trigger"]) == (0, "arm")
+        assert (code, answer["recording"]["trigger"], answer["recording"]["next_name"]) == (0, "arm", "later")
         assert "later begins when the motion's run ends" in err
+        code, answer, _ = ask("record", "--name", "second")
+        assert (code, "name second: later was asked for before" in answer["error"]["message"]) == (2, True), answer
     idle.until(lambda: idle.desk.status().recording.trigger == "request")
     assert idle.desk.status().recording.run.endswith("-service-later")
+    assert idle.desk.status().recording.next_name == ""
     assert ask("record", "--end")[0] == 0
 
 
@@ -447,6 +479,7 @@ def test_an_event_is_waited_for_recorded_and_forgotten(idle, call, ask):
     (run,) = idle.until(lambda: list(idle.bench.settings.runs_root.glob("*-service-trigger")))
     idle.until(lambda: read_manifest(run)["record"]["state"] == "closed")
     assert call("trigger", "--error-m", 1e-3, "--count", 3)[1] == "waits for error above 0.001 m, 3 times\n"
+    assert call("trigger", "--contact-force-n", 40)[1] == "waits for contact above 40 N, 1 times\n"
     assert call("trigger", "--end")[:2] == (0, "waits for no event\n")
 
 
