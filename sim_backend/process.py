@@ -261,17 +261,20 @@ def main(argv: list[str] | None = None) -> int:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     gc.collect()
     gc.freeze()
-    print(json.dumps(_ready(served, arguments.seed)), flush=True)
-    status = 0
+    is_orphan = False
     try:
+        print(json.dumps(_ready(served, arguments.seed)), flush=True)
         served.run(stop_fileno, parent_pid, arguments.linger_s)
+    except BrokenPipeError:  # who began it was killed before it was ready
+        is_orphan = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     finally:
         served.close()
         if arguments.truth is not None:
             served.rig.truth.write(arguments.truth)
-        if arguments.own_folder is not None and os.getppid() != parent_pid:  # who made it was killed
+        if arguments.own_folder is not None and (is_orphan or os.getppid() != parent_pid):
             shutil.rmtree(arguments.own_folder, ignore_errors=True)
-    return status
+    return 0
 
 
 def _ready(served: RigProcess, seed: int) -> dict:

@@ -124,3 +124,18 @@ def test_profiles_are_listed_checked_and_shown(capsys):
     assert code == 0
     assert answer["profile"]["control"]["pid_bandwidth_hz"] == 50.0  # a default, filled in
     assert "pid_bandwidth_hz = 50" in call(capsys, "profile", "show", "oled-printer")[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("jog", "--distance-m", 0.5), "--distance-m is 0.5, from the homed zero; the travel of oled-printer"),
+        (("jog", "--distance-m", "nan"), "--distance-m is nan"),
+        (("identify", "--frequency-hz", 0.05, "--duration-s", 2), "take 40 s; give a longer duration_s"),
+        (("identify", "--profile", "single-axis"), "this stage has no micro"),
+    ],
+)
+def test_what_no_stage_of_this_profile_can_do_opens_none(capsys, tmp_path, arguments, said):
+    code, answer, _ = call_json(capsys, *arguments, "--in-place", "--backend", "batch", "--runs", tmp_path / "runs")
+    assert (code, said in answer["error"]["message"]) == (2, True), answer
+    assert not (tmp_path / "runs").exists()

@@ -189,6 +189,18 @@ def test_it_ends_with_its_parent(tmp_path):
         assert time.monotonic() < limit_s, "the rig outlived its parent"
 
 
+def test_it_removes_the_folder_of_a_parent_that_is_gone_before_it_is_ready(tmp_path):
+    folder = tmp_path / "own"
+    folder.mkdir()
+    command = [sys.executable, "-m", "sim_backend", "oled-printer", "--socket", str(folder / "bus")]
+    process = subprocess.Popen([*command, "--own-folder", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()  # as by the end of the parent
+    assert process.wait(START_LIMIT_S) == 0, process.stderr.read()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert not folder.exists()
+
+
 def test_a_wrong_machine_is_said_in_the_ready_line(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "sim_backend", "no-such-machine", "--socket", str(tmp_path / "bus")],

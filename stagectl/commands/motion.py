@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rich.markup import escape
 
+from stagectl import touch_sweep
 from stagectl.commands.answer import ENDED_EARLY, EXIT_CODES, Answer, Voice
 from stagectl.commands.opening import Place, home_and_arm, law_name, opened, place
 from stagectl.commands.planning import Shape, kind_of, planned, target
@@ -18,6 +19,7 @@ from stagectl.run_page import scores_of, tables
 from stagectl.run_scores import read_truth
 from stagectl.signals import Stop
 from stagectl.supervisor import Supervisor
+from stagectl.touch_sweep import IDENTIFY_HZ, IDENTIFY_SHARE
 
 
 def run(
@@ -52,8 +54,7 @@ def identify(
 ) -> Answer:
     """Home, sweep the micro over both edges."""
     where = place(profile, backend, runs_root, seed)
-    if where.profile.micro is None:
-        raise RequestError(f"profile {where.profile.name}: this stage has no micro; there is no backlash to identify")
+    touch_sweep.planned(where.profile, IDENTIFY_SHARE, IDENTIFY_HZ, duration_s, frequency_hz)  # homing is motion too
     if where.is_value_seam:
         return _behind_value_seam(where, voice, "identify", lambda seam: seam.identify(frequency_hz, duration_s))
     return _on_stage(where, voice, "identify", None, lambda stage: stage.identify(frequency_hz, duration_s))
@@ -66,10 +67,10 @@ def jog(
     where = _with_drives(place(profile, backend, runs_root, seed), "jog")
     law = law_name(law, where.profile)
     low_m, high_m = where.profile.macro.travel_m
-    if not abs(distance_m) <= high_m - low_m:  # before anything opens: homing is motion too
+    if not low_m <= distance_m <= high_m:  # before anything opens: homing, which ends at 0, is motion too
         raise RequestError(
-            f"--distance-m is {distance_m:g}, the travel of {where.profile.name} is {high_m - low_m:g} m; "
-            "give a finite distance within it"
+            f"--distance-m is {distance_m:g}, from the homed zero; the travel of {where.profile.name} is [{low_m:g}, "
+            f"{high_m:g}] m; give a distance within it"
         )
 
     def by_distance(stage: Supervisor) -> Outcome:

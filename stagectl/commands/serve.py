@@ -30,7 +30,14 @@ def serve(
     refuse_no_folder(runs_root)
     if profile is not None:
         load_profile(profile)
-    voice.hush()
+
+    def take_over() -> None:  # signals are the service's from here on; one that came before ends the command
+        voice.check()
+        voice.hush()
+
     settings = Settings(profile or "", backend, runs_root, state or state_folder(), seed)
-    serve_stage(settings, socket or default_socket(), tcp)
+    try:
+        serve_stage(settings, socket or default_socket(), tcp, take_over)
+    except KeyboardInterrupt:
+        return Answer({}, ["ended before it began"])
     return Answer({}, [])

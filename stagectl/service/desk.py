@@ -157,6 +157,7 @@ class Desk:
         self._own: Order | None = None  # the service's own command, that others wait for
         self._own_began_m: float | None = None  # where the stage held then, and will again
         self._stop_reason = ""
+        self._stops_count = 0
         self._stop = threading.Event()
         self._record_request: str | None = None
         self._record_taken = False  # and the status does not show yet what became of it
@@ -319,6 +320,7 @@ class Desk:
         The word itself waits for no lock: others hold that while they write to the log.
         """
         self._stop_reason = reason
+        self._stops_count += 1
         self._stop.set()
         with self._lock:
             self._drop_waiting(reason)
@@ -351,9 +353,9 @@ class Desk:
             )
         if not under_way.run or under_way.trigger == ARM:
             return
-        remedy = (
-            "end that first (`stagectl record --end`)" if under_way.trigger == REQUEST else "it has the rows already"
-        )
+        remedy = "it has the rows already"
+        if under_way.trigger == REQUEST:
+            remedy = "end it (`stagectl record --end`), and ask again when that is done"
         raise Busy(f"name {name}: {under_way.run} is under way, begun by {under_way.trigger}; {remedy}")
 
     def set_trigger(self, body: messages.SetTrigger | None, key: str = "") -> None:
@@ -387,6 +389,7 @@ class Desk:
 
     def submit_planned(self, name: str, body: Any, key: str, token: str) -> messages.Command:
         """Plan a scan or a table, check it, and take it over like `submit`; plans without the desk's lock."""
+        stops_count = self._stops_count
         with self._plans:
             with self._lock:
                 used = self._used(key, name, plans.kept(body))
@@ -396,7 +399,7 @@ class Desk:
             self._check_values(name, body, self._homed_setpoint_m)
             with _unfit():
                 plan = plans.planned(body, profile, holds_m)
-            return self.submit(name, plans.kept(body), key, token, plan)
+            return self.submit(name, plans.kept(body), key, token, plan, stops_count)
 
     def check(self, name: str, body: Any, token: str) -> None:
         """Refuse a motion that this stage can't do, as submitting it would, and begin nothing.
@@ -439,10 +442,12 @@ class Desk:
             return _stream_state(order.key, known)
         if body.first_number != 0:
             raise Unfit(f"set-point {body.first_number} comes too late: no stream is under way; begin with number 0")
+        stops_count = self._stops_count
         profile, holds_m = self._where_it_holds("setpoints", token)
         with _unfit():
             plan = plans.streamed(body, profile, holds_m)
-        command = self.submit("setpoints", plans.kept(body), key or f"stream-{secrets.token_hex(8)}", token, plan)
+        key = key or f"stream-{secrets.token_hex(8)}"
+        command = self.submit("setpoints", plans.kept(body), key, token, plan, stops_count)
         return _stream_state(command.key, plan.motion)
 
     def stream_state(self) -> messages.StreamState | None:
@@ -463,12 +468,26 @@ class Desk:
             raise _not_connected(name)
         return profile, holds_m
 
-    def submit(self, name: str, body: Any, key: str, token: str, plan: plans.Plan | None = None) -> messages.Command:
-        """Take a command over, or return what became of it where its key was seen. Errors: RequestError and kinds."""
+    def submit(
+        self,
+        name: str,
+        body: Any,
+        key: str,
+        token: str,
+        plan: plans.Plan | None = None,
+        stops_count: int | None = None,
+    ) -> messages.Command:
+        """Take a command over, or return what became of it where its key was seen. Errors: RequestError and kinds.
+
+        `stops_count` is how often a stop had been asked for when its planning began: what was asked for before a stop
+        is not begun behind it.
+        """
         with self._lock:
             used = self._used(key, name, body)
             if used is not None:
                 return used.answer.message()
+            if stops_count not in (None, self._stops_count):
+                raise Busy(f"{name}: stopped before it began: {self._stop_reason}")
             self._refuse_when_closed()
             leases.holds(self._lease, token, self._clock_s())
             self._refuse_when_busy(name)

@@ -31,8 +31,9 @@ class _Asked(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
-_PLAIN = r"^[^\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]+$"
-"""Text that does nothing to the terminal it is shown on: no control characters, and none that turn it about."""
+_ODD = r"\x00-\x1f\x7f-\xa0\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\U000e0000-\U000e007f"
+_PLAIN = f"^[^ {_ODD}][^{_ODD}]*$"
+"""Text that is seen and does nothing to a terminal: no character that controls it, turns text about or has no width."""
 
 
 class TakeLease(_Asked):

@@ -6,15 +6,17 @@ import fcntl
 import os
 import socket
 import stat
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from stagectl.errors import LinkError, RequestError
+from stagectl.errors import LinkError, RecordError, RequestError
 
 SOCKET_NAME = "stagectl.socket"
 SYSTEM_FOLDER = Path("/run/stagectl")
 SOCKET_MODE = 0o660
 _BACKLOG = 64
+_AT_ONCE_S, _LOOK_S = 5.0, 0.02
 _NOBODY = (errno.ECONNREFUSED, errno.ENOENT, errno.ENOTDIR)
 """What connecting says where no service is; a live one with a full backlog says EAGAIN."""
 
@@ -58,7 +60,8 @@ def listen_unix(path: Path) -> socket.socket:
         found = path.parent.stat()
         if found.st_uid not in (0, os.getuid()) or (found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX):
             raise LinkError(f"{path.parent}: others may put a socket of theirs here; give another path with --socket")
-        with _alone(path.parent):  # or two that begin at once take each other's socket for a dead one's
+        refusal = f"{path.parent}: somebody keeps this folder locked (`lslocks`); give another path with --socket"
+        with _alone(path.parent, _AT_ONCE_S, refusal):  # or two that begin now take each other's for a dead one's
             if is_served(path):
                 raise LinkError(f"{path}: a service listens here already; stop it, or give another path with --socket")
             _remove_dead(path)
@@ -78,11 +81,33 @@ def listen_unix(path: Path) -> socket.socket:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Keep others that do the same out, until the end of the context."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+def one_service_of(state_folder: Path) -> Iterator[None]:
+    """Keep a second service from the same state, and so from the same stage. Errors: LinkError, RecordError."""
+    refusal = f"{state_folder}: another service works with this state; stop it, or give another folder with --state"
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        state_folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordError(
+            f"{state_folder}: can't be made: {error.strerror}; give another folder with --state"
+        ) from error
+    with _alone(state_folder, 0.0, refusal):
+        yield
+
+
+@contextlib.contextmanager
+def _alone(folder: Path, wait_s: float, refusal: str) -> Iterator[None]:
+    """Keep others that do the same out of a folder, until the end of the context."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    give_up_s = time.monotonic() + wait_s
+    try:
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() >= give_up_s:
+                    raise LinkError(refusal) from error
+                time.sleep(_LOOK_S)
         yield
     finally:
         os.close(descriptor)

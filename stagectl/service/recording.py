@@ -62,7 +62,7 @@ class Recording:
                 limits.on_full_disk,
                 self._log.say,
                 min(round(limits.run_length_s * rate_hz), room_count),
-                self._save_begun_window,
+                self._end_session,
             )
             if profile.record.when == ALWAYS:
                 try:
@@ -124,7 +124,7 @@ class Recording:
     def end_on_request(self, powered: bool) -> None:
         """End the run that a client asked for; a motion that is under way goes on being recorded, in its own."""
         flight, stop, text = self._recorder, Stop.OPERATOR.name, STOP_TEXT[Stop.OPERATOR]
-        self._name_after_motion = ""
+        self._name_after_motion = self._name_asked = ""
         if flight is None:
             return
         if flight.run_folder is None:
@@ -161,8 +161,9 @@ class Recording:
         if self._recorder is not None and self._window is not None and self._recorder.rows_count >= self._window[1]:
             self._save_window("around an event")
 
-    def _save_begun_window(self) -> None:
+    def _end_session(self) -> None:
         """Write what there is around an event whose end does not come any more: the session ends."""
+        self._say_not_begun()
         self.save_event()
         if self._window is not None:
             self._save_window("around an event, to the session's end")
@@ -184,13 +185,13 @@ class Recording:
         flight = self._recorder
         if flight is None:
             return None
-        run, is_due = flight.run_folder, flight.trigger_soon == REQUEST != flight.trigger
+        run = flight.run_folder
         return messages.Recording(
             run="" if run is None else run.name,
             trigger=flight.trigger,
             rows_count=flight.run_rows_count,
             trouble=flight.trouble,
-            next_name=self._name_after_motion or (self._name_asked if is_due else ""),
+            next_name=self._next_name,
             waits_for="" if self._watch is None else self._waits_for(self._watch),
         )
 
@@ -199,8 +200,21 @@ class Recording:
 
     def forget(self) -> None:
         """The session is over."""
+        self._say_not_begun()
         self._recorder = self._window = None
-        self._name_after_motion = ""
+
+    def _say_not_begun(self) -> None:
+        """Say that the session ends before a run that was asked for, where it does."""
+        if self._next_name:
+            self._log.say("record_lost", f"{self._next_name}: asked for, and the session ended before it began")
+        self._name_after_motion = self._name_asked = ""
+
+    @property
+    def _next_name(self) -> str:
+        """Name of the run that was asked for and is not there yet."""
+        flight = self._recorder
+        is_due = flight is not None and flight.trigger_soon == REQUEST != flight.trigger
+        return self._name_after_motion or (self._name_asked if is_due else "")
 
     def discard(self, session: Path) -> None:
         """Remove the folder of a session that did not come about, where it holds no row."""

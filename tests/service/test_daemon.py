@@ -2,10 +2,14 @@
 
 import asyncio
 import contextlib
+import fcntl
 import json
+import os
 import signal
 import socket
 import stat
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -41,6 +45,29 @@ def move_away(client: Client) -> None:
     assert at_m is not None
     segment = messages.Segment(target_m=-0.14 if at_m > 0.0 else 0.14, velocity_m_per_s=0.1)
     client.begin("scan", messages.Scan(segments=[segment]))
+
+
+def test_a_service_that_is_ended_while_it_begins_ends(tmp_path):
+    """The signal was swallowed, and the service worked on."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    descriptor = os.open(folder, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)  # it waits here, for a while
+    command = [sys.executable, "-m", "stagectl.cli", "serve", "single-axis", "--backend", "rig", "--json"]
+    command += ["--socket", str(folder / "s"), "--state", str(tmp_path / "state"), "--runs", str(tmp_path / "runs")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        until_s = time.monotonic() + 30.0
+        while not (tmp_path / "state").exists() and time.monotonic() < until_s:  # its signals are its own by then
+            time.sleep(0.01)
+        process.terminate()
+        time.sleep(0.2)
+        os.close(descriptor)
+        out, err = process.communicate(timeout=30.0)
+    finally:
+        process.kill()
+    assert (process.returncode, json.loads(out)["exit_code"]) == (0, 0), err
+    assert "idle" not in err
 
 
 def test_a_client_homes_moves_and_jogs(idle):

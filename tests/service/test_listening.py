@@ -15,7 +15,7 @@ import pytest
 from stagectl.client import Client
 from stagectl.errors import LinkError, ProfileError, RecordError, RequestError
 from stagectl.row import ROW
-from stagectl.service import admission, api, messages
+from stagectl.service import admission, api, messages, places
 from stagectl.service.access import BODY_LIMIT_BYTES, LEASE_HEADER, Access, Role, header, read_tokens, role_of
 from stagectl.service.admission import CONNECTIONS_LIMIT, RESERVE_COUNT
 from stagectl.service.api import application
@@ -23,7 +23,7 @@ from stagectl.service.desk import Desk
 from stagectl.service.exposition import Figures
 from stagectl.service.listener import Listener
 from stagectl.service.notify import Notifier
-from stagectl.service.places import is_served, listen_tcp, listen_unix
+from stagectl.service.places import is_served, listen_tcp, listen_unix, one_service_of
 from stagectl.service.remembered import FILE, Remembered, keep, recall
 from stagectl.service.service_log import ServiceLog
 from stagectl.service.stage_loop import StageLoop
@@ -61,6 +61,26 @@ def test_of_services_that_begin_at_once_one_has_the_socket(tmp_path):
         for listening in had:
             listening.close()
         assert len(had) == 1
+
+
+def test_a_folder_that_somebody_keeps_locked_is_not_waited_for_without_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(places, "_AT_ONCE_S", 0.1)
+    with one_service_of(tmp_path), pytest.raises(LinkError, match="somebody keeps this folder locked"):
+        listen_unix(tmp_path / "stage.socket")
+    listen_unix(tmp_path / "stage.socket").close()
+
+
+def test_a_state_has_one_service(tmp_path):
+    """With a socket of its own a second one commanded the same stage."""
+    twice = pytest.raises(LinkError, match="another service works with this state; stop it, or give another")
+    with one_service_of(tmp_path / "state"), twice, one_service_of(tmp_path / "state"):
+        pass
+    with one_service_of(tmp_path / "state"):
+        pass
+    (tmp_path / "file").write_text("")
+    no_folder = pytest.raises(RecordError, match=r"can't be made: .*; give another folder with --state")
+    with no_folder, one_service_of(tmp_path / "file"):
+        pass
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")

@@ -1,5 +1,6 @@
 """Scans, tables and streams through the service, in virtual time: refused before the first cycle, or followed."""
 
+import contextlib
 import math
 import threading
 import time
@@ -12,7 +13,7 @@ from stagectl.record import read_run
 from stagectl.replay import replay
 from stagectl.requests import Phase
 from stagectl.service import messages, plans
-from stagectl.service.desk import Unfit
+from stagectl.service.desk import Busy, Unfit
 from stagectl.service.lease import LeaseRefused
 from stagectl.signals import Stop
 from stagectl.supervisor import Supervisor
@@ -142,28 +143,45 @@ def test_a_question_begins_nothing(armed):
     assert armed.status.state == "armed"
 
 
-def test_motions_are_planned_one_at_a_time_and_a_key_once(armed):
-    """Many at once took the processor from the supervisor until its sign of life was missed."""
-    body = messages.Scan(segments=[GO(target_m=0.005), GO(target_m=0.0)])
-    found = []
+@contextlib.contextmanager
+def planned_together(bench, key):
+    """Ask three times for a scan, with the same key, while another motion is being planned; what comes of them."""
+    body, found = messages.Scan(segments=[GO(target_m=0.005), GO(target_m=0.0)]), []
 
     def submit():
-        found.append(armed.desk.submit_planned("scan", body, "together", armed.token))
+        try:
+            found.append(bench.desk.submit_planned("scan", body, key, bench.token).key)
+        except Busy as error:
+            found.append(str(error))
 
     threads = [threading.Thread(target=submit) for _ in range(3)]
-    with armed.desk._plans:  # as while one is being planned
+    with bench.desk._plans:
         for thread in threads:
             thread.start()
         time.sleep(0.1)
-        assert (found, armed.desk.command("together")) == ([], None)
-        armed.desk.ask_to_stop("it is heard meanwhile")
+        assert (found, bench.desk.command(key)) == ([], None)
+        yield found
+    for thread in threads:
+        thread.join(60.0)
+
+
+def test_motions_are_planned_one_at_a_time_and_a_key_once(armed):
+    """Many at once took the processor from the supervisor until its sign of life was missed."""
+    with planned_together(armed, "together") as found:
+        pass
+    assert found == ["together"] * 3
+    armed.until(lambda: armed.desk.command("together").state == "done")
+
+
+def test_what_is_being_planned_when_a_stop_comes_is_not_begun_behind_it(armed):
+    """It began as soon as the stage was armed again."""
+    with planned_together(armed, "stopped") as found:
+        armed.desk.ask_to_stop("a person")
         armed.until(lambda: not armed.desk.stop_asked)
         armed.until(lambda: armed.status.state == "idle")
         assert armed.do("arm", messages.Arm()).stop == "FINISHED"
-    for thread in threads:
-        thread.join(60.0)
-    assert [one.key for one in found] == ["together"] * 3
-    armed.until(lambda: armed.desk.command("together").state == "done")
+    assert found == ["scan: stopped before it began: a person"] * 3
+    assert armed.desk.command("stopped") is None
 
 
 def test_the_same_key_is_the_same_scan(armed):

@@ -481,6 +481,31 @@ def test_a_session_that_is_recorded_always_is_one_run_and_stops_or_goes_on_as_th
         assert np.all(np.diff(run.rows["cycle"]) == 1)
 
 
+def test_a_run_asked_for_that_the_session_s_end_comes_before_is_said(tmp_path):
+    """Its client was told that it begins behind the motion's."""
+    made = Bench(tmp_path)
+    made.hold_as_homed_by_truth()
+    made.desk.ask_to_record("later")
+    made.loop.step()
+    made.loop.step()
+    assert (made.status.recording.trigger, made.status.recording.next_name) == ("arm", "later")
+    made.loop.leave()
+    made.loop.run()
+    lost = ["later: asked for, and the session ended before it began"]
+    said = [entry.text for entry in made.log.last(100) if entry.event == "record_lost"]
+    assert said == (lost if runs_of(made, "later") == [] else [])
+
+
+def test_a_run_asked_for_behind_a_motion_whose_session_breaks_is_said(tmp_path):
+    made = Bench(tmp_path)
+    made.hold_as_homed_by_truth()
+    made.desk.ask_to_record("later")
+    made.loop.step()
+    made.loop._close_stage()
+    said = [entry.text for entry in made.log.last(100) if entry.event == "record_lost"]
+    assert said == ["later: asked for, and the session ended before it began"]
+
+
 def runs_of(bench, name: str) -> list[Path]:
     return sorted(bench.settings.runs_root.glob(f"*-service-{name}"))
 

@@ -347,11 +347,12 @@ def test_a_value_that_no_request_can_have_is_refused(idle):
 
 
 @pytest.mark.parametrize(
-    "strange", ["\x1b[31m", "\x9b31m", "\x9d0;title\x9c", "\u202ereversed", "two\u2028lines", "\x85"]
+    "strange", ["\x1b[31m", "\x9b31m", "\x9d0;title\x9c", "\u202ereversed", "two\u2028lines", "\x85", "\u200b"]
 )
 def test_no_holder_s_name_does_anything_to_a_terminal(idle, strange):
-    with pytest.raises(RequestError, match="holder is"):
-        idle.client.take_lease(f"anna {strange}")
+    for holder in (f"anna {strange}", " ", f" {strange}"):
+        with pytest.raises(RequestError, match="holder is"):
+            idle.client.take_lease(holder)
     assert idle.desk.lease_state() is None
 
 
@@ -405,7 +406,7 @@ def test_a_run_is_begun_shown_and_ended(idle, call, ask):
     assert run.endswith("-service-warm-up")
     assert call("record")[1] == f"{run}, begun by request\n"
     code, answer, _ = ask("record", "--name", "another")  # one at a time
-    assert (code, f"name another: {run} is under way, begun by request; end that" in answer["error"]["message"]) == (
+    assert (code, f"name another: {run} is under way, begun by request; end it" in answer["error"]["message"]) == (
         2,
         True,
     )
