@@ -14,7 +14,9 @@ KEY = "a-key-that-nobody-guesses"
 ANNA = messages.TakeLease(holder="anna", duration_s=2.0)
 BERT = messages.TakeLease(holder="bert", duration_s=1.0)
 STEP = messages.JogBy(distance_m=1e-3)
-NO_STATUS = messages.Status.model_construct(positions=messages.Positions.model_construct(setpoint_position_m=0.0))
+NO_STATUS = messages.Status.model_construct(
+    homed=False, positions=messages.Positions.model_construct(setpoint_position_m=0.0)
+)
 
 
 class Manned:
@@ -231,6 +233,7 @@ NEEDS = {
     "a command": lambda desk: desk.submit("jog", STEP, "new", "guessed"),
     "a jog": lambda desk: desk.begin_jog(messages.BeginJog(), "new", "guessed"),
     "a plan": lambda desk: desk.submit_planned("scan", messages.Scan.model_construct(), "new", "guessed"),
+    "a question": lambda desk: desk.check("scan", messages.Scan.model_construct(), "guessed"),
     "a stream": lambda desk: desk.take_setpoints(SETPOINTS, "guessed"),
     "more of a stream": lambda desk: desk.take_setpoints(LATER, "guessed"),
 }
