@@ -4,6 +4,7 @@ import threading
 
 import pytest
 
+from stagectl.profile import load_profile
 from stagectl.service import messages
 from stagectl.service.desk import Busy, Desk, Ending, Unfit
 from stagectl.service.lease import GRACE_S, Lease, LeaseRefused
@@ -275,3 +276,25 @@ def test_the_service_s_own_command_goes_under_the_lease_that_somebody_holds(one)
     one.now_s = 102.0
     one.desk.submit_own("probe", messages.Probe())
     assert one.desk.next_order() is None
+
+
+# ---- what needs no lease: a run --------------------------------------------------------------------------------------
+
+
+def test_a_run_is_asked_for_again_only_when_it_shows_what_became_of_the_last(one):
+    """Two within a moment were both accepted, and one had no run."""
+    idle = NO_STATUS.model_copy(update={"recording": None})
+    one.desk.profile = load_profile("single-axis")
+    one.desk.publish(idle, State.IDLE)
+    one.desk.ask_to_record("first")
+    for _ in ("on its way", "taken, and not shown yet"):
+        with pytest.raises(Busy, match="another client asks the same just now"):
+            one.desk.ask_to_record("second")
+        one.desk.next_record_request()
+    begins = messages.Recording(run="", trigger="", rows_count=0, trouble="", next_name="first")
+    one.desk.publish(NO_STATUS.model_copy(update={"recording": begins}), State.IDLE)
+    with pytest.raises(Busy, match="name second: first was asked for before"):
+        one.desk.ask_to_record("second")
+    one.desk.publish(idle, State.IDLE)
+    one.desk.ask_to_record("second")
+    assert one.desk.next_record_request() == "second"
