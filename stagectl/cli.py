@@ -79,10 +79,21 @@ app.add_typer(service_app)
 # ---- what can be asked: each option once --------------------------------------------------------------------------
 
 
+_PROFILE = "oled-printer"
 _AUTO = "auto takes the rig only where neither the profile's CAN interface nor its serial port exists, and says so"
 
 Profile = Annotated[
     str, _option("Profile: a name or a TOML file.", "--profile", "-p", metavar="NAME", envvar="STAGECTL_PROFILE")
+]
+OwnProfile = Annotated[
+    str | None,
+    _option(
+        f"Profile: a name or a TOML file (default: the service's; {_PROFILE} where none answers).",
+        "--profile",
+        "-p",
+        metavar="NAME",
+        envvar="STAGECTL_PROFILE",
+    ),
 ]
 Wire = Annotated[str, _option(f"auto | hardware | rig. {_AUTO}.", "--backend", metavar="WORLD")]
 DemoWorld = Annotated[
@@ -203,7 +214,7 @@ TuneResidue = Annotated[
 ]
 TuneDamping = Annotated[float, _option("Its damping ratio, at least.", "--mode-damping-ratio", min=1e-3, max=0.5)]
 
-_PROFILE, _RUNS, _GAP, _PAPER = "oled-printer", Path("runs"), Path("gap"), Path("paper")
+_RUNS, _GAP, _PAPER = Path("runs"), Path("gap"), Path("paper")
 _BUDGET, _TUNE = Path("budget"), Path("tune")
 
 
@@ -216,6 +227,11 @@ def _version(wanted: bool) -> None:
 
 
 Version = Annotated[bool, _option("Print the version.", "--version", callback=_version, is_eager=True)]
+
+
+def _own(profile: str | None) -> str:
+    """Return the profile of a stage of the command's own; without one asked for, not the service's either."""
+    return _PROFILE if profile is None else profile
 
 
 # ---- the commands -------------------------------------------------------------------------------------------------
@@ -277,7 +293,7 @@ def run(
 def identify(
     frequency_hz: SweepFrequency = None,
     duration_s: SweepDuration = 20.0,
-    profile: Profile = _PROFILE,
+    profile: OwnProfile = None,
     backend: WireOrPlant = "auto",
     seed: Seed = 1,
     runs: Runs = _RUNS,
@@ -293,8 +309,8 @@ def identify(
             body = commands.remote.checked(
                 commands.remote.messages.Identify, frequency_hz=frequency_hz, duration_s=duration_s
             )
-            return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "identify", body)
-        return commands.motion.identify(voice, profile, backend, runs, seed, frequency_hz, duration_s)
+            return commands.remote.motion(voice, socket, lease, profile, backend, "identify", body)
+        return commands.motion.identify(voice, _own(profile), backend, runs, seed, frequency_hz, duration_s)
 
     _deliver("identify", json, work)
 
@@ -308,7 +324,7 @@ def jog(
     keys: Keys = False,
     velocity_m_per_s: JogSpeed = 0.01,
     law: Law = None,
-    profile: Profile = _PROFILE,
+    profile: OwnProfile = None,
     backend: Wire = "auto",
     seed: Seed = 1,
     runs: Runs = _RUNS,
@@ -327,11 +343,11 @@ def jog(
 
     def work(voice: "Voice") -> "Answer":
         if distance_m is None:
-            return commands.jog_keys.jog(voice, socket, lease, profile, _PROFILE, backend, velocity_m_per_s)
+            return commands.jog_keys.jog(voice, socket, lease, profile, backend, velocity_m_per_s)
         if commands.remote.served(socket, lease, in_place):
             body = commands.remote.checked(commands.remote.messages.JogBy, distance_m=distance_m, law=law)
-            return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "jog", body)
-        return commands.motion.jog(voice, profile, backend, runs, seed, distance_m, law)
+            return commands.remote.motion(voice, socket, lease, profile, backend, "jog", body)
+        return commands.motion.jog(voice, _own(profile), backend, runs, seed, distance_m, law)
 
     _deliver("jog", json, work)
 
@@ -340,7 +356,7 @@ def jog(
 def move(
     target_m: MoveTarget,
     law: Law = None,
-    profile: Profile = _PROFILE,
+    profile: OwnProfile = None,
     backend: Wire = "auto",
     seed: Seed = 1,
     runs: Runs = _RUNS,
@@ -354,16 +370,16 @@ def move(
     def work(voice: "Voice") -> "Answer":
         if commands.remote.served(socket, lease, in_place):
             body = commands.remote.checked(commands.remote.messages.Move, target_m=target_m, law=law)
-            return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "move", body)
+            return commands.remote.motion(voice, socket, lease, profile, backend, "move", body)
         shape = commands.planning.Shape(None, None, None, None, None, None, None, target_m)
-        return commands.motion.run(voice, profile, backend, runs, seed, "move", shape, law)
+        return commands.motion.run(voice, _own(profile), backend, runs, seed, "move", shape, law)
 
     _deliver("move", json, work)
 
 
 @app.command(epilog=_epilog("stagectl home"))
 def home(
-    profile: Profile = _PROFILE,
+    profile: OwnProfile = None,
     backend: Wire = "auto",
     seed: Seed = 1,
     runs: Runs = _RUNS,
@@ -377,8 +393,8 @@ def home(
     def work(voice: "Voice") -> "Answer":
         if commands.remote.served(socket, lease, in_place):
             body = commands.remote.checked(commands.remote.messages.Home)
-            return commands.remote.motion(voice, socket, lease, profile, _PROFILE, backend, "home", body)
-        return commands.motion.home(voice, profile, backend, runs, seed)
+            return commands.remote.motion(voice, socket, lease, profile, backend, "home", body)
+        return commands.motion.home(voice, _own(profile), backend, runs, seed)
 
     _deliver("home", json, work)
 

@@ -13,14 +13,13 @@ from stagectl.requests import Mode, Phase
 from stagectl.session import WATCHED_ONLY
 from stagectl.signals import Stop, stop_sentence
 from stagectl.stream_motion import StreamMotion
-from stagectl.touch_sweep import IDENTIFY_HZ, IDENTIFY_SHARE, TOUCH_HZ, TOUCH_S, TOUCH_SHARE
+from stagectl.touch_sweep import IDENTIFY_HZ, IDENTIFY_SHARE, KNOWN_OF_JOINT, TOUCH_HZ, TOUCH_S, TOUCH_SHARE
 
 _INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
 _TOUCH_TRIES = 4
 _STANDSTILL_WINDOW_S = 0.2
 _STANDSTILL_M = 20e-6  # in that time: 0.1 um in a cycle of 1 ms
 _STANDSTILL_TIMEOUT_S = 3.0
-_JOINT = ("left_m", "right_m", "left_stiffness_n_per_m", "right_stiffness_n_per_m")
 
 
 class Homing(StreamMotion):
@@ -110,7 +109,7 @@ class Homing(StreamMotion):
             if not outcome.finished or estimate is None or estimate.identifiable:
                 return outcome
             width_m = float(self._belief["left_m"][0]) + float(self._belief["right_m"][0])
-            known = {name: float(self._belief[name][0]) for name in _JOINT}
+            known = {name: float(self._belief[name][0]) for name in KNOWN_OF_JOINT}
             if math.isfinite(estimate.right_sd_m):
                 known["right_m"], known["left_m"] = estimate.right_m, width_m - estimate.right_m
             elif math.isfinite(estimate.left_sd_m):
@@ -207,7 +206,7 @@ class Homing(StreamMotion):
         macro_zero = float(status["macro_counts"]) - float(status["macro_position_m"]) / macro_scale
         half_m = 0.5 * estimate.width_m
         estimate = replace(estimate, left_m=half_m - centre_m, right_m=half_m + centre_m)
-        for name in _JOINT:
+        for name in KNOWN_OF_JOINT:
             self._belief[name] = getattr(estimate, name)
         self._publish_update(macro_zero, end_zero)
         return estimate
@@ -226,10 +225,12 @@ class Homing(StreamMotion):
         status = self.status()
         if status["phase"] != Phase.TRACKING or status["segment_left_rows"] > 0:
             raise RequestError("a backlash is replaced between moves only; wait until the stage holds")
-        before = {name: float(self._belief[name][0]) for name in _JOINT}
-        for name in _JOINT:
+        before = {name: float(self._belief[name][0]) for name in KNOWN_OF_JOINT}
+        for name in KNOWN_OF_JOINT:
             self._belief[name] = getattr(estimate, name)
-        self._event("backlash_replaced", before=before, after={name: float(self._belief[name][0]) for name in _JOINT})
+        self._event(
+            "backlash_replaced", before=before, after={name: float(self._belief[name][0]) for name in KNOWN_OF_JOINT}
+        )
         macro_scale, end_scale = self._scales()
         macro_zero = float(status["macro_counts"]) - float(status["macro_position_m"]) / macro_scale
         end_zero = float(status["end_counts"]) - float(status["end_position_m"]) / end_scale
@@ -237,7 +238,7 @@ class Homing(StreamMotion):
 
     def believed_backlash(self) -> dict[str, float]:
         """Return what the compensation believes of the joint: edges and stiffness."""
-        return {name: float(self._belief[name][0]) for name in _JOINT}
+        return {name: float(self._belief[name][0]) for name in KNOWN_OF_JOINT}
 
     def probe(self) -> Outcome:
         """Touch both edges with `TOUCH_SHARE` of the touch force (5 N at most), only where the profile permits it."""

@@ -38,6 +38,10 @@ class Joint(NamedTuple):
     """How long a side must be pressed before its samples count, while it is unknown."""
 
 
+KNOWN_OF_JOINT = Joint._fields[:4]
+"""What an identification finds, and a sweep is planned by: edges and stiffnesses."""
+
+
 class TouchSweep(NamedTuple):
     """A swing of end minus macro about the middle of the gap."""
 
@@ -63,7 +67,7 @@ def planned(
     if backlash is None or micro is None:
         raise RequestError(f"profile {profile.name}: this stage has no micro; there is no backlash to identify")
     joint = Joint(
-        **(believed or {name: getattr(backlash, name) for name in Joint._fields[:4]}),
+        **(believed or {name: getattr(backlash, name) for name in KNOWN_OF_JOINT}),
         damping_n_s_per_m=contact_damping_n_s_per_m(profile.effects),
         touch_force_n=backlash.touch_force_n,
         hold_s=HOLD_RATIO * filter_time_s(profile),

@@ -69,8 +69,7 @@ def jog(
     voice: Voice,
     socket: Path | None,
     token: str | None,
-    profile: str,
-    usual_profile: str,
+    profile: str | None,
     backend: str,
     speed_m_per_s: float,
 ) -> Answer:
@@ -79,7 +78,7 @@ def jog(
         raise RequestError("--keys needs a terminal to read keys from; give --distance-m instead")
     with connected(socket) as stage, leased(voice, stage, token):
         status = stage.status()
-        refuse_other(status, profile, usual_profile, backend)
+        refuse_other(status, profile, backend)
         voice.note(status.banner)
         failed = prepared(voice, stage, status, "jog")
         if failed is not None:

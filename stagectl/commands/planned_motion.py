@@ -15,10 +15,10 @@ from stagectl.errors import RequestError
 from stagectl.service import messages
 
 
-def scan(voice: Voice, socket: Path | None, token: str | None, usual_profile: str, path: Path) -> Answer:
+def scan(voice: Voice, socket: Path | None, token: str | None, path: Path) -> Answer:
     """Follow the scan program of a TOML file."""
     body = _program(path)
-    return remote.motion(voice, socket, token, usual_profile, usual_profile, "auto", "scan", body)
+    return remote.motion(voice, socket, token, None, "auto", "scan", body)
 
 
 def _program(path: Path) -> messages.Scan:
@@ -30,16 +30,14 @@ def _program(path: Path) -> messages.Scan:
         raise RequestError(f"{path}: {messages.sentence(error.errors()[0])}") from error
 
 
-def follow(
-    voice: Voice, socket: Path | None, token: str | None, usual_profile: str, path: Path, law: str | None
-) -> Answer:
+def follow(voice: Voice, socket: Path | None, token: str | None, path: Path, law: str | None) -> Answer:
     """Follow the motion of a CSV file."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise RequestError(f"trajectory {path}: {error}; give a CSV file with the header t_s,position_m") from error
     body = remote.checked(messages.Follow, text=text, law=law)
-    return remote.motion(voice, socket, token, usual_profile, usual_profile, "auto", "follow", body)
+    return remote.motion(voice, socket, token, None, "auto", "follow", body)
 
 
 def stream(voice: Voice, socket: Path | None, token: str | None, period_s: float) -> Answer:

@@ -73,6 +73,19 @@ def _once_heeded(stage: Client, heeded: Callable[[messages.Recording | None], bo
     return found
 
 
+def _once_heard(stage: Client) -> messages.Status:
+    """Return a status that knows what was asked before: the second new one, as the first may be in the making.
+
+    By what it waits for that can't be seen: it may have waited for the same before.
+    """
+    found, newer_count, give_up_s = stage.status(), 0, time.monotonic() + _HEED_S
+    while newer_count < 2 and time.monotonic() < give_up_s:
+        time.sleep(_LOOK_S)
+        before, found = found, stage.status()
+        newer_count += found.uptime_s != before.uptime_s
+    return found
+
+
 def trigger(voice: Voice, socket: Path | None, asked: dict[str, Any], reversal: bool, end: bool) -> Answer:
     """Show which event is waited for, set one, or end that."""
     level = "error_m" in asked or "contact_force_n" in asked
@@ -87,11 +100,10 @@ def trigger(voice: Voice, socket: Path | None, asked: dict[str, Any], reversal: 
         status = stage.status()
         if end:
             stage.end_trigger()
-            status = _once_heeded(stage, lambda found: found is None or not found.waits_for)
         elif reversal or level:
-            before = "" if status.recording is None else status.recording.waits_for
             stage.set_trigger(checked(messages.SetTrigger, **asked))
-            status = _once_heeded(stage, lambda found: found is not None and found.waits_for not in ("", before))
+        if end or reversal or level:
+            status = _once_heard(stage)
     voice.note(status.banner)
     found = status.recording
     waits_for = "" if found is None else found.waits_for

@@ -100,8 +100,7 @@ def motion(
     voice: Voice,
     socket: Path | None,
     token: str | None,
-    profile: str,
-    usual_profile: str,
+    profile: str | None,
     backend: str,
     name: str,
     body: BaseModel,
@@ -109,7 +108,7 @@ def motion(
     """Home where it is needed, arm, move; with a lease of our own the stage comes to rest without power."""
     with connected(socket) as stage:
         status = stage.status()
-        refuse_other(status, profile, usual_profile, backend)
+        refuse_other(status, profile, backend)
         voice.note(f"{status.profile} through the service: {status.banner}")
         with leased(voice, stage, token):
             if name != "home":  # which is what the others may begin with
@@ -121,15 +120,15 @@ def motion(
     return answered(command, at_rest)
 
 
-def refuse_other(status: messages.Status, profile: str, usual_profile: str, backend: str) -> None:
+def refuse_other(status: messages.Status, profile: str | None, backend: str) -> None:
     """Refuse options that mean another stage than the service has."""
-    path = Path(profile)
-    is_its_file = path.exists() and path.resolve() == Path(status.profile_path).resolve()
-    if not is_its_file and profile not in (usual_profile, status.profile):
-        raise RequestError(
-            f"--profile {profile}: the service has {status.profile} ({status.profile_path}); leave the option out, "
-            "or add --in-place for a stage of its own"
-        )
+    if profile not in (None, status.profile):
+        path = Path(profile)
+        if not (path.exists() and path.resolve() == Path(status.profile_path).resolve()):
+            raise RequestError(
+                f"--profile {profile}: the service has {status.profile} ({status.profile_path}); leave the option (or "
+                "STAGECTL_PROFILE) out, or add --in-place for a stage of its own"
+            )
     if backend not in ("auto", status.backend):
         raise RequestError(
             f"--backend {backend}: the service has {status.backend or 'none yet'}; change that with "

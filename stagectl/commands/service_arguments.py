@@ -57,7 +57,6 @@ ScanFile = Annotated[Path, typer.Argument(help="TOML: repeat_count, start_m, [[s
 TableFile = Annotated[Path, typer.Argument(help="CSV with the header t_s,position_m.", metavar="FILE.csv")]
 Period = Annotated[float, option("Time from one position to the next, s.", "--period-s", min=1e-4, max=1.0)]
 Law = Annotated[str | None, option("Control law: dsmc | pid (default: the profile's).", "--law", metavar="LAW")]
-_USUAL_PROFILE = "oled-printer"
 
 
 @service_app.command(
@@ -167,7 +166,7 @@ def log(lines: LinesCount = 30, socket: Socket = None, json: Json = False) -> No
 def scan(program: ScanFile, lease: LeaseToken = None, socket: Socket = None, json: Json = False) -> None:
     """Follow a scan program: segments, dwells, repetitions; checked whole before the first cycle."""
     work = commands.planned_motion.scan
-    deliver("scan", json, lambda voice: work(voice, socket, lease, _USUAL_PROFILE, program), compiles=False)
+    deliver("scan", json, lambda voice: work(voice, socket, lease, program), compiles=False)
 
 
 @service_app.command(epilog=epilog("stagectl follow motion.csv"))
@@ -176,7 +175,7 @@ def follow(
 ) -> None:
     """Follow the motion of a file, smoothed and checked before the first cycle."""
     work = commands.planned_motion.follow
-    deliver("follow", json, lambda voice: work(voice, socket, lease, _USUAL_PROFILE, table, law), compiles=False)
+    deliver("follow", json, lambda voice: work(voice, socket, lease, table, law), compiles=False)
 
 
 @service_app.command(epilog=epilog("my-program | stagectl stream --period-s 0.01"))

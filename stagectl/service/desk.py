@@ -170,6 +170,8 @@ class Desk:
         self.powered = False
         """Whether the stage's thread has the stage in a state with power."""
         self.profile: Profile | None = None
+        self.joint: dict[str, float] | None = None
+        """Edges and stiffnesses that a sweep would go by, as far as is known; None for the profile's."""
         self.scope = Scope(1000.0)
 
     # ---- what the stage's thread does ------------------------------------------------------------------------
@@ -410,12 +412,12 @@ class Desk:
         with self._lock:
             self._refuse_when_closed()
             leases.holds(self._lease, token, self._clock_s())
-            profile, holds_m = self.profile, self._homed_setpoint_m or 0.0
+            profile, holds_m, joint = self.profile, self._homed_setpoint_m or 0.0, self.joint
             if profile is None:
                 raise _not_connected(name)
             self._check_values(name, body, holds_m)
         with self._plans, _unfit():
-            plans.rehearse(body, profile, holds_m)
+            plans.rehearse(body, profile, holds_m, joint)
 
     def take_setpoints(self, body: messages.Setpoints, token: str, key: str = "") -> messages.StreamState:
         """Begin a stream, or take what goes on with it; `key` is the stream's, the same with each of its blocks.

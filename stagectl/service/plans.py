@@ -1,5 +1,6 @@
 """What a request for a scan, a table or a stream becomes: a plan that was checked before anything moves. Pure."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel
@@ -55,10 +56,11 @@ def planned(body: BaseModel, profile: Profile, holds_m: float) -> Plan | None:
     return None
 
 
-def rehearse(body: BaseModel, profile: Profile, holds_m: float) -> None:
+def rehearse(body: BaseModel, profile: Profile, holds_m: float, joint: Mapping[str, float] | None = None) -> None:
     """Plan what is planned only when it begins, too. Errors: RequestError.
 
-    A sweep goes by the joint that is believed then, here the profile's; a stream begins at its own first position.
+    A sweep goes by the edges and stiffnesses of `joint`, the profile's without; a stream begins at its own first
+    position.
     """
     if isinstance(body, messages.Identify):
         touch_sweep.planned(
@@ -67,6 +69,7 @@ def rehearse(body: BaseModel, profile: Profile, holds_m: float) -> None:
             touch_sweep.IDENTIFY_HZ,
             body.duration_s,
             body.frequency_hz,
+            joint,
         )
     elif isinstance(body, messages.Setpoints):
         streamed(body, profile, body.position_m[0])

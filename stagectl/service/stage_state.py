@@ -24,6 +24,7 @@ from stagectl.service.view import BANNERS, backlash_message, health, limits, pos
 from stagectl.service.wear_watch import WearWatch
 from stagectl.signals import STOP_TEXT, Stop
 from stagectl.supervisor import Supervisor
+from stagectl.touch_sweep import KNOWN_OF_JOINT
 from stagectl.wear import PRODUCTION
 
 _LATENESS_EVERY_S = 0.5
@@ -93,8 +94,19 @@ class StageState:
     def show(self) -> messages.Status:
         """Publish where things stand."""
         status = self._view()
+        self.desk.joint = self._joint()
         self.desk.publish(status, self._state)
         return status
+
+    def _joint(self) -> dict[str, float] | None:
+        """Return the edges and stiffnesses that a sweep would go by: before homing, that finds them, the last known."""
+        stage = self._stage
+        if stage is None or self._opening:
+            return None
+        if self._homed:
+            return stage.believed_backlash()
+        kept = self._memory.joint(self._backend, stage.profile.name)
+        return None if kept is None else {name: getattr(kept, name) for name in KNOWN_OF_JOINT}
 
     def recall_fault(self) -> None:
         """Begin with the fault that nobody has acknowledged, or with the end of a service whose stage had power."""

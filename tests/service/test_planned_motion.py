@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 
 from stagectl.backend import BatchBackend
+from stagectl.outcome import BacklashEstimate
 from stagectl.record import read_run
 from stagectl.replay import replay
 from stagectl.requests import Phase
 from stagectl.service import messages, plans
 from stagectl.service.desk import Busy, Unfit
 from stagectl.service.lease import LeaseRefused
+from stagectl.service.service_log import now_text
+from stagectl.service.view import backlash_message
 from stagectl.signals import Stop
 from stagectl.supervisor import Supervisor
+from stagectl.wear import IDENTIFIED
 from tests.service.test_stage_loop import Bench
 from tests.struck_stage import home_by_truth
 
@@ -141,6 +145,37 @@ def test_a_question_begins_nothing(armed):
     armed.loop.step()
     assert np.all(reference(armed)["setpoint_position_m"] == 0.0)
     assert armed.status.state == "armed"
+
+
+def test_a_sweep_is_asked_about_with_the_joint_that_it_would_meet(tmp_path):
+    """The wider the gap, the slower: at 0.3 Hz kang-2023's 15 mm are met too hard, 3 mm are not."""
+    bench = Bench(tmp_path, "kang-2023")
+    sweep = messages.Identify(frequency_hz=0.3)
+    narrow = BacklashEstimate(1.5e-3, 1.5e-3, 1e-6, 1e-6, 1000.0, 1000.0, 1.0, 1.0)
+    loop = bench.loop
+    try:
+        bench.until(lambda: loop._state == "idle")
+        loop.step()
+        bench.take()
+        with pytest.raises(Unfit, match=r"with a gap of 15 mm .* at most 0.208 Hz"):
+            bench.desk.check("identify", sweep, bench.token)
+        kept = backlash_message(narrow, "run", "kang-2023", loop._backend, now_text(), IDENTIFIED)
+        loop._memory.keep_joint(kept)  # as it was before a restart: what homing will find again
+        loop.step()
+        bench.desk.check("identify", sweep, bench.token)
+
+        stage = loop._stage
+        home_by_truth(stage, stage.backend.rig.plant_state())
+        loop._homed = True
+        loop.step()
+        with pytest.raises(Unfit, match="with a gap of 15 mm"):  # homing believed that, whatever was kept
+            bench.desk.check("identify", sweep, bench.token)
+        stage.take_backlash(narrow)
+        loop.step()
+        bench.desk.check("identify", sweep, bench.token)
+    finally:
+        loop.leave()
+        loop.run()
 
 
 @contextlib.contextmanager
