@@ -267,9 +267,8 @@ class Homing(StreamMotion):
 
 
 def _refuse_no_joint(estimate: BacklashEstimate) -> None:
-    stiffnesses = (estimate.left_stiffness_n_per_m, estimate.right_stiffness_n_per_m)
-    believable = math.isfinite(estimate.centre_m) and 0.0 < estimate.width_m < math.inf
-    if not (believable and all(0.0 < stiffness < math.inf for stiffness in stiffnesses)):
+    if not touch_sweep.could_be({name: getattr(estimate, name) for name in KNOWN_OF_JOINT}):
+        stiffnesses = (estimate.left_stiffness_n_per_m, estimate.right_stiffness_n_per_m)
         raise RequestError(
             f"backlash of {estimate.width_m:g} m about {estimate.centre_m:g} m with {stiffnesses} N/m: every value "
             "must be finite, width and stiffness above 0; identify again, touching both edges"

@@ -42,6 +42,12 @@ KNOWN_OF_JOINT = Joint._fields[:4]
 """What an identification finds, and a sweep is planned by: edges and stiffnesses."""
 
 
+def could_be(joint: Mapping[str, float]) -> bool:
+    """Tell whether such edges and stiffnesses are those of a joint: all finite, width and stiffnesses above 0."""
+    left_m, right_m, *stiffnesses = (joint[name] for name in KNOWN_OF_JOINT)
+    return 0.0 < left_m + right_m < math.inf and all(0.0 < stiffness < math.inf for stiffness in stiffnesses)
+
+
 class TouchSweep(NamedTuple):
     """A swing of end minus macro about the middle of the gap."""
 

@@ -83,6 +83,8 @@ def _once_heard(stage: Client) -> messages.Status:
         time.sleep(_LOOK_S)
         before, found = found, stage.status()
         newer_count += found.uptime_s != before.uptime_s
+    if newer_count < 2:
+        raise RecordError(f"the service did not say within {_HEED_S:g} s what became of it; see `stagectl trigger`")
     return found
 
 

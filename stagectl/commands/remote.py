@@ -122,11 +122,12 @@ def motion(
 
 def refuse_other(status: messages.Status, profile: str | None, backend: str) -> None:
     """Refuse options that mean another stage than the service has."""
-    if profile not in (None, status.profile):
+    if profile not in (None, status.profile, status.profile_path):
         path = Path(profile)
         if not (path.exists() and path.resolve() == Path(status.profile_path).resolve()):
+            its_name = status.profile or "not read its own"
             raise RequestError(
-                f"--profile {profile}: the service has {status.profile} ({status.profile_path}); leave the option (or "
+                f"--profile {profile}: the service has {its_name} ({status.profile_path}); leave the option (or "
                 "STAGECTL_PROFILE) out, or add --in-place for a stage of its own"
             )
     if backend not in ("auto", status.backend):

@@ -118,12 +118,15 @@ class Order:
 
 
 @contextlib.contextmanager
-def _unfit() -> Iterator[None]:
-    """Say of what a plan refuses that the values don't fit."""
+def _unfit(more: str = "") -> Iterator[None]:
+    """Say of what a plan refuses that the values don't fit, and `more`."""
     try:
         yield
     except RequestError as error:
-        raise Unfit(str(error)) from error
+        raise Unfit(f"{error}{more}") from error
+
+
+_FOUND_ANEW = "; that is the joint as it was found last: `stagectl home` finds it anew"
 
 
 def _not_connected(name: str) -> RequestError:
@@ -416,7 +419,8 @@ class Desk:
             if profile is None:
                 raise _not_connected(name)
             self._check_values(name, body, holds_m)
-        with self._plans, _unfit():
+        is_found_anew = name == "identify" and joint is not None and self._homed_setpoint_m is None
+        with self._plans, _unfit(_FOUND_ANEW if is_found_anew else ""):
             plans.rehearse(body, profile, holds_m, joint)
 
     def take_setpoints(self, body: messages.Setpoints, token: str, key: str = "") -> messages.StreamState:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from stagectl import touch_sweep
 from stagectl.errors import RequestError, StagectlError
 from stagectl.profile import Profile
 from stagectl.requests import Phase
@@ -106,7 +107,8 @@ class StageState:
         if self._homed:
             return stage.believed_backlash()
         kept = self._memory.joint(self._backend, stage.profile.name)
-        return None if kept is None else {name: getattr(kept, name) for name in KNOWN_OF_JOINT}
+        found = {} if kept is None else {name: getattr(kept, name) for name in KNOWN_OF_JOINT}
+        return found if found and touch_sweep.could_be(found) else None  # a file can be edited
 
     def recall_fault(self) -> None:
         """Begin with the fault that nobody has acknowledged, or with the end of a service whose stage had power."""

@@ -104,6 +104,7 @@ class StageWorld(StageState):
                 give_back(folder)
                 self._recording.discard(folder)
             self._retry_at_s = time.monotonic() + _RETRY_AFTER_FAILURE_S
+        self.desk.joint = self._joint()
         self.desk.profile = stage.profile
         self._memory.keep(
             profile=str(profile.source_path),

@@ -163,6 +163,15 @@ def test_a_sweep_is_asked_about_with_the_joint_that_it_would_meet(tmp_path):
         loop._memory.keep_joint(kept)  # as it was before a restart: what homing will find again
         loop.step()
         bench.desk.check("identify", sweep, bench.token)
+        loop._memory.keep_joint(kept.model_copy(update={"left_m": 0.01}))
+        loop.step()
+        with pytest.raises(Unfit, match=r"with a gap of 11.5 mm .*found last: `stagectl home` finds it anew"):
+            bench.desk.check("identify", sweep, bench.token)
+        for name, value in (("left_stiffness_n_per_m", 0.0), ("left_m", -0.002), ("right_m", math.nan)):
+            loop._memory.keep_joint(kept.model_copy(update={name: value}))  # edited: no joint that could be
+            loop.step()
+            with pytest.raises(Unfit, match="with a gap of 15 mm"):
+                bench.desk.check("identify", sweep, bench.token)
 
         stage = loop._stage
         home_by_truth(stage, stage.backend.rig.plant_state())

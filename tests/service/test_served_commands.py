@@ -13,6 +13,7 @@ import pytest
 
 from stagectl import cli
 from stagectl.client import Client
+from stagectl.commands import remote
 from stagectl.commands.answer import INTERRUPTED
 from stagectl.errors import LinkError, RequestError, StagectlError
 from stagectl.record import read_manifest
@@ -126,6 +127,15 @@ def test_identify_is_refused_where_it_can_t_be(idle, ask):
         assert "anna holds the lease" in answer["error"]["message"]
     assert ask("identify", "--profile", "single-axis")[0] == 2
     assert ask("identify", "--duration-s", 1)[0] == 2
+
+
+def test_a_service_that_has_not_read_its_profile_refuses_for_its_own_reason(idle):
+    """A restart into a fault: the profile is known by name only, and asked for by that is no other stage."""
+    status = idle.desk.status().model_copy(update={"profile": "", "profile_path": "my-stage"})
+    for profile in (None, "my-stage"):
+        remote.refuse_other(status, profile, "auto")
+    with pytest.raises(RequestError, match=r"--profile other: the service has not read its own \(my-stage\)"):
+        remote.refuse_other(status, "other", "auto")
 
 
 def test_an_identification_that_somebody_stops_ended_early(idle, ask, call):
