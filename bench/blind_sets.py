@@ -260,14 +260,13 @@ def search(job: Job) -> Searched:
         if not job.keep:
             for path in folder.iterdir():
                 path.unlink()
-        samples_count = sum(log.samples_count for log in held or training) * (1 if blind.believed.micro is None else 2)
         return Searched(
             job.seed,
             truth,
             in_words_of_the_truth(findings),
             len(held),
             (findings.reducible_before[1], findings.reducible_after[1]),
-            float(np.sqrt(2.0 * samples_count)),  # of a sum of so many squares of unit variance
+            findings.reducible_sds[1],
             took_s,
         )
     except Exception as error:  # noqa: BLE001  whatever it is, the other sets go on and this one counts as wrong

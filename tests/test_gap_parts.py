@@ -22,7 +22,7 @@ from stagectl.gap.left_over import one_curve_for_many
 from stagectl.gap.log import Log, log_of_rows
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
-from stagectl.gap.selection import Judge
+from stagectl.gap.selection import FLOOR_VARIANCE, Judge
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
 
@@ -204,6 +204,31 @@ def test_what_training_leaves_open_does_not_speak_against_the_truth():
     judge = _table_judge(draw, [one, other])
     assert judge.foretold([one, other]) > judge.foretold([one]) + 50.0
     assert {group.key[0] for group in judge.select()} == {"one", "other"}
+
+
+@pytest.mark.parametrize(("touching", "folds"), [({2}, 2), ({1, 2}, 3), (set(), 3)])
+def test_a_run_that_alone_touches_the_joint_is_learnt_from_and_not_held_out(touching, folds):
+    def draw(run, random):
+        clear = random.standard_normal(4000)
+        knee, contact = ((run in touching) * random.standard_normal(4000) for _ in range(2))
+        return [random.standard_normal(4000) + 0.5 * clear + 2.0 * knee, clear, knee, 10.0 * contact]
+
+    stiffness = Group(("left_stiffness_n_per_m", "parameter"), (3,), prior_sds=(0.01,))
+    both = [Group((name, "contact"), (column,)) for name, column in (("clear", 1), ("knee", 2))]
+    judge = _table_judge(draw, both, base=[stiffness], training=3)
+    before, after = judge.reducible_before()[1], judge.reducible(both)[1]
+    assert before == pytest.approx(4000.0 * (0.25 * folds + (4.0 * len(touching) if folds == 3 else 0.0)), rel=0.15)
+    assert after < 3.0 * judge.floor_sds()[1]
+    assert judge.floor_sds()[1] == pytest.approx(np.sqrt(3.0 * 4000 * folds))
+
+
+def test_the_floor_scatters_by_what_its_noise_is_known_to():
+    """White noise, as large as it is in the upper 40 % of its frequencies: 2000 draws."""
+    random = np.random.default_rng(3)
+    z = random.standard_normal((2000, 1000))
+    power = np.abs(np.fft.rfft(z, axis=1)) ** 2 / 1000
+    noise = power[:, np.fft.rfftfreq(1000) > 0.3].mean(axis=1)
+    assert np.var((z * z).sum(axis=1) / noise) == pytest.approx(FLOOR_VARIANCE * 1000, rel=0.1)
 
 
 @pytest.mark.parametrize(("training", "runs"), [(2, 3), (3, 3)])

@@ -65,3 +65,4 @@ class Findings:
     refitted_sds: dict[str, float] = field(default_factory=dict)  # absent from findings of older versions
     profile_path: str = ""  # "" where the belief came from no file
     profile_sha256: str = ""
+    reducible_sds: tuple[float, float] = (0.0, 0.0)  # standard errors of the floors; 0 in older findings

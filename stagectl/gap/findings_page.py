@@ -179,18 +179,23 @@ def _error_text(name: str, error: float, sd: float | None = None) -> str:
 
 def _gap_table(findings: Findings) -> Table:
     rows: list[list[str | Quantity]] = []
-    for name, before, after in zip(
-        ("training runs", "held-out runs"), findings.reducible_before, findings.reducible_after, strict=True
+    for name, before, after, sd in zip(
+        ("training runs", "held-out runs"),
+        findings.reducible_before,
+        findings.reducible_after,
+        findings.reducible_sds,
+        strict=True,
     ):
         closed = f"{rounded(100.0 * (1.0 - after / before), 3)} %" if before > 0.0 else "nothing to close"
-        rows.append([name, _grouped(before), _grouped(after), closed])
+        rows.append([name, _grouped(before), _grouped(after), f"+- {_grouped(sd)}", closed])
     note = (
         "What is above the floor, in squares of the noise; 0 is the floor itself. Before: known parameters refitted, "
-        "nothing named. On held-out runs every structural value is the one that the training runs gave."
+        "nothing named. On held-out runs every structural value is the one that the training runs gave; where no run "
+        "was kept apart each is held out once, but for one that alone touches a side of the joint."
     )
     if findings.unknown is not None:
         note += " After: with what would explain a part, though it is not stated as a name."
-    return Table("Reducible gap", ["", "before", "after", "closed"], rows, note)
+    return Table("Reducible gap", ["", "before", "after", "floor", "closed"], rows, note)
 
 
 def _force_table(residuals: Sequence[Residual], unknown: bool) -> Table:

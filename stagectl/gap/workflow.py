@@ -137,4 +137,5 @@ def _found(
         refitted_sds={name: sd for name, (_, sd) in refitted.items()},
         profile_path=believed.path,
         profile_sha256=believed.sha256,
+        reducible_sds=look.search.judge.floor_sds(),
     )
