@@ -7,7 +7,7 @@ from drivers import cia402
 from sim_backend.faults import Fault
 from sim_backend.machine import load_machine
 from stagectl.backend import BatchBackend
-from stagectl.errors import LinkError
+from stagectl.errors import DriveError, LinkError
 from stagectl.profile import load_profile
 from stagectl.record import read_run
 from stagectl.requests import Phase
@@ -219,3 +219,36 @@ def test_a_drive_that_is_sent_off_its_index_is_stopped(tmp_path, single_profile,
     assert 0.01 < fastest_m_per_s < 0.12
     assert np.ptp(truth["macro_position_m"][away]) < 1.5e-3  # of the 2 mm that it was sent
     assert not read_run(tmp_path / "run").rows["homing_id"].any()
+
+
+PATIENT = {"trip__sensor_age_s": 0.3, "trip__overrun_s": 0.3, "trip__rpdo_deadline_s": 0.1}
+
+
+def touched_by_a_late_host(folder, late_for_s):
+    """Home where the host is away for 12 ms in every 200 ms of touching, from its first cycle on."""
+    backend, began_t_ns, rows_count = BatchBackend(load_machine("oled-printer"), seed=1), [], 0
+
+    def hold_up(rows):
+        nonlocal rows_count
+        if not rows["homing_id"].any() or rows["run_phase"][-1] != Phase.TRACKING:
+            return
+        began_t_ns.append(backend.wire.t_ns)
+        rows_count += rows.size
+        if rows_count >= 200 and backend.wire.t_ns - began_t_ns[0] < 1e9 * late_for_s:
+            rows_count = 0
+            backend.wire.advance_to(backend.wire.t_ns + 12_000_000)
+
+    profile = with_values(load_profile("oled-printer"), **PATIENT)
+    with Supervisor(profile, backend, folder, observe=hold_up) as stage:
+        return stage.home(), 1e-9 * (backend.wire.t_ns - began_t_ns[0])
+
+
+def test_a_sweep_that_the_host_spoilt_is_swept_again(tmp_path):
+    """Neither edge was learnt, though both were met: that is no joint out of reach."""
+    home, took_s = touched_by_a_late_host(tmp_path / "once", 6.0)
+    assert home.finished
+    machine = load_machine("oled-printer").backlash
+    assert home.backlash.width_m == pytest.approx(machine.left_m + machine.right_m, abs=4.0 * home.backlash.left_sd_m)
+    assert took_s > 12.0
+    with pytest.raises(DriveError, match=r"in 4 sweeps at .* with [1-9]\d+ missed cycles; .* the host"):
+        touched_by_a_late_host(tmp_path / "always", 100.0)

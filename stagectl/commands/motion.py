@@ -9,13 +9,11 @@ from stagectl import touch_sweep
 from stagectl.commands.answer import ENDED_EARLY, EXIT_CODES, Answer, Voice
 from stagectl.commands.opening import Place, home_and_arm, law_name, opened, place
 from stagectl.commands.planning import Shape, kind_of, planned, target
-from stagectl.commands.scores_json import scores_json
 from stagectl.commands.tables import terminal
 from stagectl.errors import LinkError, RequestError
 from stagectl.outcome import Outcome
 from stagectl.record import read_run
 from stagectl.run_folder import reserved
-from stagectl.run_page import scores_of, tables
 from stagectl.run_scores import read_truth
 from stagectl.signals import Stop
 from stagectl.supervisor import Supervisor
@@ -139,6 +137,9 @@ def _behind_value_seam(where: Place, voice: Voice, name: str, motion: Callable[[
 
 def _answer(voice: Voice, folder: Path, outcome: Outcome, facts: dict) -> Answer:
     """Say how it ended, with the scores of what was recorded."""
+    from stagectl.commands.scores_json import scores_json  # a second more of scipy and matplotlib before any motion
+    from stagectl.run_page import scores_of, tables
+
     voice.progress("scoring", 0.0)
     run = read_run(folder)
     scores = scores_of(run, read_truth(folder))

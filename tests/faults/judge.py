@@ -151,7 +151,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     if drawn.must_stop and not facts.fault_kind and facts.phase not in AT_WILL and not _drive_homes(drawn, facts):
         found.append((COURSE, "it went on"))
     if not drawn.may_stop and facts.fault_kind:
-        found.append((COURSE, f"stopped by {facts.fault_kind}"))
+        found.append((COURSE, f"stopped by {facts.fault_kind}: {facts.fault_text}"))
     travel_m = bound_m = drift_m = 0.0
     begun: float | None = None
     end = rests = int(np.searchsorted(t_ns, facts.judged_until_t_ns))
