@@ -122,17 +122,10 @@ class Judge:
 
         Without recordings kept apart, each training recording is held out once.
         """
-        training, held = self.training, self.held
-        whole = solve([*self.base, *groups], training)
-        if held:
-            return whole.gain, held_out_gain(whole, held)
-        if len(training) == 1:
-            return whole.gain, whole.gain
-        apart = 0.0
-        for k in range(len(training)):
-            others = training[:k] + training[k + 1 :]
-            apart += held_out_gain(solve([*self.base, *groups], others), [training[k]])
-        return whole.gain, apart
+        model = [*self.base, *groups]
+        whole = solve(model, self.training).gain
+        folds = self._folds()
+        return whole, sum(held_out_gain(solve(model, learnt), told) for learnt, told in folds) if folds else whole
 
     def foretold(self, groups: Sequence[Group]) -> float:
         """Return how well training foretells held-out recordings: what all gain together, less what training does.
@@ -140,14 +133,9 @@ class Judge:
         Amplitudes that training leaves open cost nothing where they turn out otherwise: by their values alone a wrong
         mass that only one recording shows spoke against itself (-937 squares on a set of which it was the truth).
         """
-        training, held = self.training, self.held
         whole = self.gain(groups)
-        if held:
-            return whole - solve([*self.base, *groups], training).gain
-        if len(training) == 1:
-            return whole
-        folds = (training[:k] + training[k + 1 :] for k in range(len(training)))
-        return sum(whole - solve([*self.base, *groups], others).gain for others in folds)
+        folds = self._folds()
+        return sum(whole - solve([*self.base, *groups], learnt).gain for learnt, _ in folds) if folds else whole
 
     def gain(self, groups: Sequence[Group]) -> float:
         """Return the gain of base and `groups` on all recordings together."""
@@ -164,38 +152,45 @@ class Judge:
     def reducible(self, groups: Sequence[Group]) -> tuple[float, float]:
         """Return what is left above the floor on training and held-out recordings, in squares of the noise.
 
-        Without recordings kept apart, each is held out once of which the others can know (`_folds`).
+        Without recordings kept apart, each is held out once of which the others can know.
         """
         model = [*self.base, *groups]
         left = apart = _above_floor(self.training) - solve(model, self.training).gain
-        if folds := self._folds():
+        if folds := self._foretellable():
             apart = sum(_above_floor(told) - held_out_gain(solve(model, learnt), told) for learnt, told in folds)
         return max(left, 0.0), max(apart, 0.0)
 
     def _folds(self) -> list[tuple[list[Sums], list[Sums]]]:
-        """Return (learnt from, foretold) of what is held out; none where there is nothing to foretell.
-
-        One that alone touches a side of the joint is never held out: a knee of 13 um, of which the others had not met
-        the contact, left a third of all that there was, though it was named with its size.
-        """
+        """Return (learnt from, held out) of recordings; none of a single one."""
         training, held = self.training, self.held
         if held:
             return [(training, held)]
         if len(training) == 1:
             return []
+        return [(training[:k] + training[k + 1 :], [s]) for k, s in enumerate(training)]
+
+    def _foretellable(self) -> list[tuple[list[Sums], list[Sums]]]:
+        """Return the folds of which those that are learnt from can know what is held out.
+
+        One that alone touches a side of the joint is never held out: a knee of 13 um, of which the others had not met
+        the contact, left a third of all that there was, though it was named with its size.
+        """
+        folds = self._folds()
+        if self.held:
+            return folds
         touching = [
-            [k for k, s in enumerate(training) if any(s.gram[c, c] * sd * sd >= 1.0 for c, sd in stiffness)]
+            [k for k, s in enumerate(self.training) if any(s.gram[c, c] * sd * sd >= 1.0 for c, sd in stiffness)]
             for stiffness in (
                 list(zip(group.columns, group.prior_sds, strict=True))
                 for group in self.base
                 if group.key in _STIFFNESSES
             )
         ]
-        return [(training[:k] + training[k + 1 :], [s]) for k, s in enumerate(training) if [k] not in touching]
+        return [fold for k, fold in enumerate(folds) if [k] not in touching]
 
     def floor_sds(self) -> tuple[float, float]:
         """Return by how much the floor of training and of held-out recordings scatters, in squares of the noise."""
-        told = [s for _, some in self._folds() for s in some] or self.training
+        told = [s for _, some in self._foretellable() for s in some] or self.training
         sizes = (sum(s.count for s in some) for some in (self.training, told))
         one, other = (float(np.sqrt(FLOOR_VARIANCE * size)) for size in sizes)
         return one, other
@@ -205,7 +200,7 @@ class Judge:
 
         Fitted beside an effect that nobody names yet, known parameters can make a recording worse that no fit saw.
         """
-        told = [s for _, some in self._folds() for s in some] or self.training
+        told = [s for _, some in self._foretellable() for s in some] or self.training
         left, apart = self.reducible([])
         return min(left, max(_above_floor(self.training), 0.0)), min(apart, max(_above_floor(told), 0.0))
 
