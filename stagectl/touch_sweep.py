@@ -48,6 +48,10 @@ def could_be(joint: Mapping[str, float]) -> bool:
     return 0.0 < left_m + right_m < math.inf and all(0.0 < stiffness < math.inf for stiffness in stiffnesses)
 
 
+class PressedTooHard(RequestError):
+    """The joint that is believed would be pressed harder than it may: another one might not be."""
+
+
 class TouchSweep(NamedTuple):
     """A swing of end minus macro about the middle of the gap."""
 
@@ -103,7 +107,8 @@ def plan(
     """Plan a sweep that presses both sides with `force_share` of the touch force, and never with more than all of it.
 
     Without `asked_hz` it runs at `usual_hz`, or slower where the joint asks for it, and then long enough to swing five
-    times. RequestError where `asked_hz` would press too hard, or might: where nobody says how the joint is damped.
+    times. Errors: PressedTooHard where `asked_hz` would press too hard; RequestError where it might, as nobody says how
+    the joint is damped, and where `duration_s` is too short.
     """
     half_m = 0.5 * (joint.left_m + joint.right_m)
     stiffest = max(joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m)
@@ -126,7 +131,7 @@ def plan(
             f"{usual_hz:g} Hz, or give the effect contact_damping"
         )
     if not asked_hz <= limit_hz:
-        raise RequestError(
+        raise PressedTooHard(
             f"frequency_hz = {asked_hz:g}: with a gap of {2e3 * half_m:g} mm and {joint.damping_n_s_per_m:g} N s/m the "
             f"joint would be pressed harder than backlash.touch_force_n = {joint.touch_force_n:g} N; "
             f"ask for at most {math.floor(limit_hz * 1e3) * 1e-3:g} Hz"

@@ -28,6 +28,7 @@ from stagectl.service.states import State
 from stagectl.service.used_keys import ANSWERS_COUNT, Used, UsedKeys, digest
 from stagectl.service.view import jog_velocity_m_per_s
 from stagectl.streaming import SetpointBuffer
+from stagectl.touch_sweep import PressedTooHard
 
 
 class Busy(RequestError):
@@ -118,12 +119,13 @@ class Order:
 
 
 @contextlib.contextmanager
-def _unfit(more: str = "") -> Iterator[None]:
-    """Say of what a plan refuses that the values don't fit, and `more`."""
+def _unfit(is_kept_joint: bool = False) -> Iterator[None]:
+    """Say of what a plan refuses that the values don't fit; and where it is a joint that homing finds anew, so."""
     try:
         yield
     except RequestError as error:
-        raise Unfit(f"{error}{more}") from error
+        is_found_anew = is_kept_joint and isinstance(error, PressedTooHard)
+        raise Unfit(f"{error}{_FOUND_ANEW if is_found_anew else ''}") from error
 
 
 _FOUND_ANEW = "; that is the joint as it was found last: `stagectl home` finds it anew"
@@ -419,8 +421,8 @@ class Desk:
             if profile is None:
                 raise _not_connected(name)
             self._check_values(name, body, holds_m)
-        is_found_anew = name == "identify" and joint is not None and self._homed_setpoint_m is None
-        with self._plans, _unfit(_FOUND_ANEW if is_found_anew else ""):
+            is_kept_joint = joint is not None and self._homed_setpoint_m is None
+        with self._plans, _unfit(is_kept_joint):
             plans.rehearse(body, profile, holds_m, joint)
 
     def take_setpoints(self, body: messages.Setpoints, token: str, key: str = "") -> messages.StreamState:

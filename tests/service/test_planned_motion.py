@@ -167,6 +167,8 @@ def test_a_sweep_is_asked_about_with_the_joint_that_it_would_meet(tmp_path):
         loop.step()
         with pytest.raises(Unfit, match=r"with a gap of 11.5 mm .*found last: `stagectl home` finds it anew"):
             bench.desk.check("identify", sweep, bench.token)
+        with pytest.raises(Unfit, match=r"duration_s = 3: .* or a higher frequency_hz$"):  # no matter of the joint
+            bench.desk.check("identify", messages.Identify(frequency_hz=0.1, duration_s=3.0), bench.token)
         for name, value in (("left_stiffness_n_per_m", 0.0), ("left_m", -0.002), ("right_m", math.nan)):
             loop._memory.keep_joint(kept.model_copy(update={name: value}))  # edited: no joint that could be
             loop.step()
