@@ -37,6 +37,9 @@ class Joint(NamedTuple):
     hold_s: float = 0.0
     """How long a side must be pressed before its samples count, while it is unknown."""
 
+    found: str = ""
+    """How it was found, for whoever is refused by it."""
+
 
 KNOWN_OF_JOINT = Joint._fields[:4]
 """What an identification finds, and a sweep is planned by: edges and stiffnesses."""
@@ -46,10 +49,6 @@ def could_be(joint: Mapping[str, float]) -> bool:
     """Tell whether such edges and stiffnesses are those of a joint: all finite, width and stiffnesses above 0."""
     left_m, right_m, *stiffnesses = (joint[name] for name in KNOWN_OF_JOINT)
     return 0.0 < left_m + right_m < math.inf and all(0.0 < stiffness < math.inf for stiffness in stiffnesses)
-
-
-class PressedTooHard(RequestError):
-    """The joint that is believed would be pressed harder than it may: another one might not be."""
 
 
 class TouchSweep(NamedTuple):
@@ -68,10 +67,12 @@ def planned(
     asked_hz: float | None = None,
     believed: Mapping[str, float] | None = None,
     centre_m: float = 0.0,
+    found: str = "",
 ) -> trajectories.Trajectory:
     """Plan a sweep as `plan` does, about where the macro stands, and check that the end can follow it.
 
-    `believed` are the edges and stiffnesses that are believed by now; the profile's without. Errors: RequestError.
+    `believed` are the edges and stiffnesses that are believed by now, and `found` says how they were found; the
+    profile's without. Errors: RequestError.
     """
     backlash, micro, macro = profile.backlash, profile.micro, profile.macro
     if backlash is None or micro is None:
@@ -81,6 +82,7 @@ def planned(
         damping_n_s_per_m=contact_damping_n_s_per_m(profile.effects),
         touch_force_n=backlash.touch_force_n,
         hold_s=HOLD_RATIO * filter_time_s(profile),
+        found=found,
     )
     swing = trajectories.sweep(
         *plan(joint, force_share, usual_hz, duration_s, asked_hz), centre_m=centre_m, dt_s=profile.cycle.period_s
@@ -107,8 +109,8 @@ def plan(
     """Plan a sweep that presses both sides with `force_share` of the touch force, and never with more than all of it.
 
     Without `asked_hz` it runs at `usual_hz`, or slower where the joint asks for it, and then long enough to swing five
-    times. Errors: PressedTooHard where `asked_hz` would press too hard; RequestError where it might, as nobody says how
-    the joint is damped, and where `duration_s` is too short.
+    times. RequestError where `asked_hz` would press too hard, where it might, as nobody says how the joint is damped, and
+    where `duration_s` is too short.
     """
     half_m = 0.5 * (joint.left_m + joint.right_m)
     stiffest = max(joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m)
@@ -131,10 +133,10 @@ def plan(
             f"{usual_hz:g} Hz, or give the effect contact_damping"
         )
     if not asked_hz <= limit_hz:
-        raise PressedTooHard(
+        raise RequestError(
             f"frequency_hz = {asked_hz:g}: with a gap of {2e3 * half_m:g} mm and {joint.damping_n_s_per_m:g} N s/m the "
             f"joint would be pressed harder than backlash.touch_force_n = {joint.touch_force_n:g} N; "
-            f"ask for at most {math.floor(limit_hz * 1e3) * 1e-3:g} Hz"
+            f"ask for at most {math.floor(limit_hz * 1e3) * 1e-3:g} Hz{f'; {joint.found}' if joint.found else ''}"
         )
     if not duration_s >= 2.0 / asked_hz:
         raise RequestError(

@@ -28,7 +28,6 @@ from stagectl.service.states import State
 from stagectl.service.used_keys import ANSWERS_COUNT, Used, UsedKeys, digest
 from stagectl.service.view import jog_velocity_m_per_s
 from stagectl.streaming import SetpointBuffer
-from stagectl.touch_sweep import PressedTooHard
 
 
 class Busy(RequestError):
@@ -119,16 +118,15 @@ class Order:
 
 
 @contextlib.contextmanager
-def _unfit(is_kept_joint: bool = False) -> Iterator[None]:
-    """Say of what a plan refuses that the values don't fit; and where it is a joint that homing finds anew, so."""
+def _unfit() -> Iterator[None]:
+    """Say of what a plan refuses that the values don't fit."""
     try:
         yield
     except RequestError as error:
-        is_found_anew = is_kept_joint and isinstance(error, PressedTooHard)
-        raise Unfit(f"{error}{_FOUND_ANEW if is_found_anew else ''}") from error
+        raise Unfit(str(error)) from error
 
 
-_FOUND_ANEW = "; that is the joint as it was found last: `stagectl home` finds it anew"
+_FOUND_LAST = "that is the joint as it was found last: `stagectl home` finds it anew"
 
 
 def _not_connected(name: str) -> RequestError:
@@ -421,9 +419,9 @@ class Desk:
             if profile is None:
                 raise _not_connected(name)
             self._check_values(name, body, holds_m)
-            is_kept_joint = joint is not None and self._homed_setpoint_m is None
-        with self._plans, _unfit(is_kept_joint):
-            plans.rehearse(body, profile, holds_m, joint)
+            found = _FOUND_LAST if joint is not None and self._homed_setpoint_m is None else ""
+        with self._plans, _unfit():
+            plans.rehearse(body, profile, holds_m, joint, found)
 
     def take_setpoints(self, body: messages.Setpoints, token: str, key: str = "") -> messages.StreamState:
         """Begin a stream, or take what goes on with it; `key` is the stream's, the same with each of its blocks.

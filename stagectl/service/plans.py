@@ -56,11 +56,13 @@ def planned(body: BaseModel, profile: Profile, holds_m: float) -> Plan | None:
     return None
 
 
-def rehearse(body: BaseModel, profile: Profile, holds_m: float, joint: Mapping[str, float] | None = None) -> None:
+def rehearse(
+    body: BaseModel, profile: Profile, holds_m: float, joint: Mapping[str, float] | None = None, found: str = ""
+) -> None:
     """Plan what is planned only when it begins, too. Errors: RequestError.
 
-    A sweep goes by the edges and stiffnesses of `joint`, the profile's without; a stream begins at its own first
-    position.
+    A sweep goes by the edges and stiffnesses of `joint`, of which `found` says how they were found, the profile's
+    without; a stream begins at its own first position.
     """
     if isinstance(body, messages.Identify):
         touch_sweep.planned(
@@ -70,6 +72,7 @@ def rehearse(body: BaseModel, profile: Profile, holds_m: float, joint: Mapping[s
             body.duration_s,
             body.frequency_hz,
             joint,
+            found=found,
         )
     elif isinstance(body, messages.Setpoints):
         streamed(body, profile, body.position_m[0])
