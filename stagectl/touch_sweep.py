@@ -109,8 +109,8 @@ def plan(
     """Plan a sweep that presses both sides with `force_share` of the touch force, and never with more than all of it.
 
     Without `asked_hz` it runs at `usual_hz`, or slower where the joint asks for it, and then long enough to swing five
-    times. RequestError where `asked_hz` would press too hard, where it might, as nobody says how the joint is damped, and
-    where `duration_s` is too short.
+    times. Errors: RequestError where `asked_hz` would press too hard, or might, as nobody says how the joint is damped,
+    and where `duration_s` is too short.
     """
     half_m = 0.5 * (joint.left_m + joint.right_m)
     stiffest = max(joint.left_stiffness_n_per_m, joint.right_stiffness_n_per_m)
