@@ -14,7 +14,7 @@ from tests.faults import campaign
 from tests.faults.judge import BACK, BARS, BEGUN_CYCLES, GENTLE, LOST, TRAVEL
 from tests.faults.kinds import KINDS
 
-RUNS = 60  # every kind, most of them twice
+RUNS = 70  # every kind twice
 FULL_RUNS = 900
 
 BEGUN = Bar("batch: stop begun after fault detection, worst run", "cycles", BEGUN_CYCLES)

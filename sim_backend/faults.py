@@ -31,7 +31,7 @@ SENSOR_KINDS = (
     "unplug",
     "clock_drift",
 )
-MACHINE_KINDS = ("edge_jump", "obstacle")
+MACHINE_KINDS = ("edge_jump", "obstacle", "weak_motor")
 KINDS = BUS_KINDS + DRIVE_KINDS + SENSOR_KINDS + MACHINE_KINDS
 
 _NEEDS = {
@@ -55,6 +55,7 @@ _NEEDS = {
     "clock_drift": ("ppm",),
     "edge_jump": ("offset_m",),
     "obstacle": ("offset_m",),
+    "weak_motor": ("node_id", "force_ratio"),
 }
 _FOREVER_S = 1e9
 
@@ -77,6 +78,7 @@ class Fault:
     subindex: int | None = None
     value: int | None = None
     offset_m: float | None = None  # of encoder or right edge; of an obstacle, from where the macro is
+    force_ratio: float | None = None  # of what a motor gave before
     ppm: float | None = None
     seed: int | None = None  # of the bytes of garbage; None = letters, none of which belongs to a line
     axis: str | None = None  # macro | end | both

@@ -18,7 +18,8 @@ _IN_TURN = {  # kinds whose phases come in turn: mostly the one that they are th
     "client vanishes": tuple(
         phase for other in ("at rest", *MOVING, "identifying", "homing") for phase in ("jogging", other)
     ),
-    "obstacle (following error)": ("constant speed", "jogging", "accelerating", "decelerating", *PHASES),
+    "following error": (*MOVING, "identifying", *MOVING, "jogging", *PHASES),
+    "obstacle": ("constant speed", "jogging", "accelerating", "decelerating", *PHASES),
 }
 
 

@@ -22,7 +22,9 @@ that way, which is the overshoot of its position loop, and by what its integral 
 most the rest of its greatest force, F / m - w^2 e at e from its goal, and throws it F / (m w^2) - e beyond. All that is
 a spring, no command: only forward travel is judged until the obstacle is gone and the loop stands, by the same bound;
 from there on the macro must stand as after any fault. A drive whose encoder jumps goes with it, there and back, with
-that overshoot: it holds on nothing else. By how much more such an encoder misleads its ramp is no excuse.
+that overshoot: it holds on nothing else. By how much more such an encoder misleads its ramp is no excuse. An end that
+swings, as its motor is too weak to hold it, pulls at a drive that settles as long as that lasts: all of its 0.2 mm
+may come on top then.
 
 A motion that no fault stops, or none has stopped yet, is judged in `unstopped.py`; a stop that the operator asked for
 by the same bound with the law's ramp. Behind the acknowledgement nothing may move or get power until it is asked for.
@@ -68,7 +70,8 @@ NONSENSE = "nonsense taken for a profile, or refused unclearly"
 BARS = (TRAVEL, STRUCK, LIMP, STANDSTILL, BEGUN, LOST, UNREADABLE, STRANGER, BACK, COURSE, NONSENSE)
 """What a run can miss."""
 GENTLE = (
-    "a: the greatest gain of speed until it was noticed, at most a plan's; behind an obstacle forward only; "
+    "and 20 um, 0.2 mm where the end swings; a: the greatest gain of speed until it was noticed, at most a plan's; "
+    "behind an obstacle forward only, and back by its drive's overshoot; of an encoder that jumps 1.2 times that; "
     "of a deaf drive from its own watch on"
 )
 """Where the bound differs from v t + a t^2 / 2 + (v + a t)^2 / (2 ramp) with what was true at the fault."""
@@ -182,8 +185,10 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         stands, rests = _stands(seen, rest, end), end if rest is None else rest
         shifted_m = (1.0 + OVERSHOOT) * drawn.encoder_m
         back_m = shifted_m
+        free = min(int(np.searchsorted(t_ns, facts.fault_t_ns + round(1e9 * drawn.lasts_s))), end)
+        if drawn.swings:
+            stands = min(max(stands, free + SETTLED_SAMPLES), end)
         if drawn.pushed:
-            free = min(int(np.searchsorted(t_ns, facts.fault_t_ns + round(1e9 * drawn.lasts_s))), end)
             stands = min(max(stands, free + RELEASED_SAMPLES), end)
             away_m = (position[at:stands] - position[at]) * np.sign(velocity[at])
             pushed_m = abs(float(position[stands - 1] - position[free]))
@@ -198,7 +203,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             bound_m = back_m + _bound_m(t_ns, velocity, at, detection_s + facts.late_s, of, drawn.open_loop)
         if MICRO in drawn.without_power:
             found += _too_far(seen, at, stands, of)
-        if not travel_m <= bound_m + STANDSTILL_M:
+        if not travel_m <= bound_m + (SETTLING_M if drawn.swings else STANDSTILL_M):
             found.append((TRAVEL, f"macro went {travel_m * 1e3:.3f} mm, bound {bound_m * 1e3:.3f} mm"))
         if rest is None and not dark:
             found.append((STANDSTILL, "it never stood still"))
@@ -215,7 +220,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             found.append((STANDSTILL, f"macro moved {held_m * 1e6:.0f} um after standstill, with power"))
         if noticed is not None and not dark:
             heard = noticed if MACRO not in drawn.deaf else max(noticed, facts.fault_t_ns + round(1e9 * SILENCE_S))
-            begun = _begun_cycles(seen, record, heard, facts.judged_until_t_ns)
+            begun = _begun_cycles(facts, record, heard)
             if not begun <= BEGUN_CYCLES:
                 found.append((BEGUN, f"stop begun {begun:.0f} cycles after detection"))
     lost, owed = _cycles_lost(facts, record, rests)
@@ -356,22 +361,31 @@ def _moved_after(seen: dict[str, Any], stands: int, end: int) -> tuple[float, fl
     return float(moved_m[:held_until].max(initial=0.0)), float(moved_m[~powered].max(initial=0.0))
 
 
-def _begun_cycles(seen: dict[str, Any], record: Record, noticed_t_ns: int, until_t_ns: int) -> float:
-    """Return the cycles from the row that noticed to the drive that no longer follows, or the reference that slows."""
+def _begun_cycles(facts: Facts, record: Record, noticed_t_ns: int) -> float:
+    """Return the cycles from the row that noticed to the drive that no longer follows, or the reference that slows.
+
+    On a host that keeps no time they are those that it had: one a SYNC.
+    """
+    seen = facts.seen
     t_ns, phase, speed = (record.columns[name] for name in ("t_ns", "run_phase", "setpoint_velocity_m_per_s"))
     row = int(np.searchsorted(t_ns, noticed_t_ns))
-    at = int(np.searchsorted(seen["t_ns"], noticed_t_ns))
-    end = int(np.searchsorted(seen["t_ns"], until_t_ns))
+    at, end = np.searchsorted(seen["t_ns"], (noticed_t_ns, facts.judged_until_t_ns))
     left = np.flatnonzero(seen["states"][at:end, 0] != ENABLED)
-    drive_s = 1e-9 * float(seen["t_ns"][at + left[0]] - noticed_t_ns) if left.size else float("inf")
+    begun_t_ns = [int(seen["t_ns"][at + left[0]])] if left.size else []
     if phase[row] == _LAW_STOPS:
         begin = abs(float(speed[max(row - 1, 0)]))
         slower = np.flatnonzero(np.abs(speed[row:]) < begin)
-        law_s = 0.0 if begin == 0.0 else float("inf")
-        if slower.size and begin > 0.0:
-            law_s = 1e-9 * float(t_ns[row + slower[0]] - noticed_t_ns)
-        drive_s = min(drive_s, law_s)
-    return max(0.0, np.ceil(drive_s / CYCLE_S - 1.0))  # a state is seen at the sample after it changed
+        if begin == 0.0:
+            begun_t_ns.append(noticed_t_ns)
+        elif slower.size:
+            begun_t_ns.append(int(t_ns[row + slower[0]]))
+    if not begun_t_ns:
+        return float("inf")
+    first_t_ns = min(begun_t_ns)
+    cycles = np.ceil(1e-9 * float(first_t_ns - noticed_t_ns) / CYCLE_S)
+    if facts.is_host_time:
+        cycles = np.count_nonzero((facts.sync_t_ns > noticed_t_ns) & (facts.sync_t_ns <= first_t_ns))
+    return max(0.0, float(cycles) - 1.0)  # a state is seen at the sample after it changed
 
 
 def _cycles_lost(facts: Facts, record: Record, rests: int) -> tuple[int, int]:

@@ -52,6 +52,7 @@ class Drawn:
     open_loop: bool = False  # the drive keeps its last force until the fault is noticed
     silent: bool = False  # the operator says nothing more: a jog ends by its own hold, before the lease does
     encoder_m: float = 0.0  # by which the drive's own encoder is off for a while: it holds on that
+    swings: bool = False  # the end, with nothing that holds it: the macro's drive feels that while it settles
     pushed: bool = False  # by something that is no command: how far is not judged
     by_lasers: bool = False  # of what only a law goes by: while the drive homes by itself it must stop nothing
     nonsense: Nonsense | None = None  # what the profile is edited to; it is read when the stage has no power
@@ -166,10 +167,17 @@ def emergency(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def statusword_stuck(rng: np.random.Generator, phase: str) -> Drawn:
+    """Alone it says nothing wrong; where the drive fails meanwhile, its EMCY is all that says so."""
+    must = grave(rng)
     node_id, duration_s = one_of(rng, (MACRO, MICRO)), between(rng, 0.05, 1.0)
     fault = Fault("stuck_statusword", node_id=node_id, duration_s=duration_s)
     text = f"statusword of node {node_id} stuck for {duration_s * 1e3:.0f} ms"
-    return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
+    if not must:
+        return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
+    fails_s = CYCLE_S * int(rng.integers(1, 20))
+    trouble = Fault("emergency", at_s=fails_s, node_id=node_id, code=0x2310)
+    text += f", EMCY 0x2310 after {fails_s * 1e3:.0f} ms"
+    return Drawn(text, (fault, trouble), detection_s=AT_ONCE_S + fails_s, lasts_s=duration_s)
 
 
 def drive_reboot(rng: np.random.Generator, phase: str) -> Drawn:
@@ -328,8 +336,26 @@ def edge_jump(rng: np.random.Generator, phase: str) -> Drawn:
     )
 
 
+def following_error(rng: np.random.Generator, phase: str) -> Drawn:
+    """The micro's motor loses force, as with a winding that opens: the end falls behind its reference.
+
+    With none left it shows where a motion gains speed or loses it. A law that fights for its force may keep up with
+    a part of it, and a sweep may be about to turn or to end.
+    """
+    must = phase in ("accelerating", "decelerating") and bool(rng.random() < 0.75)
+    ratio = 0.0 if must else between(rng, 0.01, 0.9)
+    duration_s = between(rng, 1.0, 1.5) if must else between(rng, 0.05, 1.5)
+    return Drawn(
+        f"micro's motor at {ratio:.0%} of its force for {duration_s * 1e3:.0f} ms",
+        (Fault("weak_motor", node_id=MICRO, force_ratio=ratio, duration_s=duration_s),),
+        must_stop=must,
+        lasts_s=duration_s,
+        swings=True,
+    )
+
+
 def obstacle(rng: np.random.Generator, phase: str) -> Drawn:
-    """Something lies in the way of the macro: a following error."""
+    """Something lies in the way of the macro."""
     offset_m = between(rng, 1e-3, 60e-3)
     faults = tuple(Fault("obstacle", offset_m=side * offset_m, duration_s=1.5) for side in (-1.0, 1.0))
     return Drawn(f"obstacles {offset_m * 1e3:.0f} mm away", faults, must_stop=False, lasts_s=1.5, pushed=True)
@@ -418,7 +444,7 @@ KINDS: dict[str, Draw] = {
     "unplug and replug": unplugged,
     "input trips": input_trips,
     "backlash jump": edge_jump,
-    "obstacle (following error)": obstacle,
+    "obstacle": obstacle,
     "host overrun": host_held_up,
     "supervisor hangs": supervisor_hangs,
     "servo gone": servo_gone,
@@ -426,5 +452,6 @@ KINDS: dict[str, Draw] = {
     "client vanishes": client_vanishes,
     "two operators": second_operator,
     "nonsense profile": nonsense_profile,
+    "following error": following_error,
 }
 """Every kind, by the name that the tables use."""

@@ -17,7 +17,7 @@ from stagectl.errors import LinkError, RecordError, StagectlError
 from stagectl.record import read_run
 from tests.faults.draws import one_of
 from tests.faults.house import IDENTIFY_S, LOOK_S, House
-from tests.faults.judge import AT_WILL, BACK, BEGUN, COURSE, REST_M_PER_S, Record, judge
+from tests.faults.judge import AT_WILL, BACK, COURSE, REST_M_PER_S, Record, Verdict, judge
 from tests.faults.kinds import MACRO, MICRO
 from tests.faults.mechanics import mechanics_of
 from tests.faults.operator_program import JOG_HOLD_S
@@ -76,8 +76,7 @@ class RealResult:
     scenario: Scenario
     fault_kind: str
     violations: tuple[tuple[str, str], ...]
-    travel_m: float
-    bound_m: float
+    verdict: Verdict | None  # None: there was no scene to judge
     took_s: float
     skipped: str = ""
 
@@ -120,20 +119,20 @@ def run(seed: int, folder: Path) -> RealResult:
     scenario = drawn(seed)
     shutil.rmtree(folder, ignore_errors=True)
     found: list[tuple[str, str]] = []
-    fault_kind, travel_m, bound_m = "", 0.0, 0.0
+    fault_kind, verdict = "", None
     for attempt in range(_TRIES):
         try:
-            found, fault_kind, travel_m, bound_m = _lived(folder / str(attempt), scenario)
+            found, fault_kind, verdict = _lived(folder / str(attempt), scenario)
             break
         except pytest.skip.Exception as error:
-            return RealResult(seed, scenario, "", (), 0.0, 0.0, time.monotonic() - began_s, str(error))
+            return RealResult(seed, scenario, "", (), None, time.monotonic() - began_s, str(error))
         except HostHeldUp as error:
             found = [(COURSE, f"{_TRIES} times: {error}")]
-    return RealResult(seed, scenario, fault_kind, tuple(found), travel_m, bound_m, time.monotonic() - began_s)
+    return RealResult(seed, scenario, fault_kind, tuple(found), verdict, time.monotonic() - began_s)
 
 
-def _lived(folder: Path, scenario: Scenario) -> tuple[list[tuple[str, str]], str, float, float]:
-    """Play a run in a house of its own; return what it missed, its fault, its travel and the bound of that."""
+def _lived(folder: Path, scenario: Scenario) -> tuple[list[tuple[str, str]], str, Verdict | None]:
+    """Play a run in a house of its own; return what it missed, its fault, and what the judges saw."""
     runs = None
     with contextlib.ExitStack() as closing:
         if scenario.fault.disk_bytes:
@@ -145,11 +144,10 @@ def _lived(folder: Path, scenario: Scenario) -> tuple[list[tuple[str, str]], str
         finally:
             house.close()
         if isinstance(facts, str):
-            return [(BACK, f"the scene could not be set: {facts}")], "", 0.0, 0.0
+            return [(BACK, f"the scene could not be set: {facts}")], "", None
         record = _record(house.daemon.runs)
     verdict = judge(scenario.fault.drawn, facts, record, mechanics_of(scenario.profile))
-    found = [one for one in verdict.violations if one[0] != BEGUN]  # in cycles of a host that keeps none
-    return found, facts.fault_kind, verdict.travel_m, verdict.bound_m
+    return list(verdict.violations), facts.fault_kind, verdict
 
 
 def _record(runs: Path) -> Record:
@@ -190,7 +188,7 @@ def _play(house: House, scenario: Scenario) -> Facts | str:
     begun_t_ns, trouble = under_way(house, scenario)
     if trouble:
         return trouble
-    facts = Facts(begun_t_ns=begun_t_ns, phase=scenario.phase, jog_hold_s=JOG_HOLD_S)
+    facts = Facts(begun_t_ns=begun_t_ns, phase=scenario.phase, jog_hold_s=JOG_HOLD_S, is_host_time=True)
     facts.planned_m_per_s = {"jogging": scenario.speed_m_per_s, "moving": TOP_M_PER_S}.get(scenario.phase, 0.0)
     before, drawn_fault = house.state(), scenario.fault.drawn
     facts.fault_t_ns = house.t_ns()

@@ -64,6 +64,7 @@ class Facts:
     fault_kind: str = ""
     fault_text: str = ""
     late_s: float = 0.0  # by which a host held up who had to notice it
+    is_host_time: bool = False  # cycles are as long as a host has them, and counted by SYNC
     planned_m_per_s: float = 0.0  # how fast what was asked for may be
     target_m: float | None = None  # of a move
     stop_asked_t_ns: int = 0  # by the operator, while it moved; 0 = not

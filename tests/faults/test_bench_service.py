@@ -89,7 +89,7 @@ def test_what_no_run_measured_does_not_hold():
 
 
 def test_a_run_with_real_processes_that_was_skipped_measured_nothing(monkeypatch):
-    skipped = real.RealResult(0, real.drawn(0), "", (), 0.0, 0.0, 1.0, "mounting a small disk needs root")
+    skipped = real.RealResult(0, real.drawn(0), "", (), None, 1.0, "mounting a small disk needs root")
     monkeypatch.setattr(real, "run", lambda seed, folder: skipped)
     found = list(service_processes.figures(full=False, say=lambda text: None, seeds=[0]))
     assert {figure.holds for figure in found[1:]} == {False}
@@ -405,7 +405,7 @@ def test_the_last_figure_is_how_long_all_parts_took(monkeypatch):
 
 def test_a_part_that_breaks_takes_no_other_along_and_is_a_missed_bar(monkeypatch):
     def breaks(**_):
-        yield judged(service_batch.COUNT, 60)
+        yield judged(service_batch.COUNT, service_batch.RUNS)
         raise RuntimeError("the servo was made anew")
 
     monkeypatch.setattr(service, "PARTS", {"soak": breaks, "batch": lambda **_: iter([judged(COUNT, 10)])})
@@ -416,8 +416,8 @@ def test_a_part_that_breaks_takes_no_other_along_and_is_a_missed_bar(monkeypatch
 
 
 def test_too_few_runs_are_a_missed_bar():
-    entries = [entry("EMCY")] * 59
-    (figure, *_) = service_batch.of_entries(entries, list(range(59)), service_batch.COUNT)
+    entries = [entry("EMCY")] * (service_batch.RUNS - 1)
+    (figure, *_) = service_batch.of_entries(entries, list(range(service_batch.RUNS - 1)), service_batch.COUNT)
     assert figure.holds is False
     assert service_batch.COUNT_FULL.limit == 900
     assert (COUNT.limit, COUNT_FULL.limit) == (10, 100)
@@ -425,7 +425,7 @@ def test_too_few_runs_are_a_missed_bar():
 
 def test_cycles_lost_with_real_processes_are_a_missed_bar(monkeypatch):
     scenario = real.drawn(0)
-    lost = real.RealResult(0, scenario, "LinkError", ((LOST, "7 cycles on the bus have no row"),), 0.0, 0.0, 1.0)
+    lost = real.RealResult(0, scenario, "LinkError", ((LOST, "7 cycles on the bus have no row"),), None, 1.0)
     monkeypatch.setattr(real, "run", lambda seed, folder: lost)
     found = {one.figure: one for one in service_processes.figures(full=False, say=lambda text: None, seeds=[0])}
     assert found[f"real processes: {LOST}"].holds is False

@@ -143,6 +143,17 @@ def test_judges_see_a_drive_that_goes_on_after_detection():
     assert BEGUN in bars_missed(facts, record)
 
 
+def test_on_a_host_that_keeps_no_time_cycles_are_counted_by_sync():
+    facts, record = rest_after(2.0)
+    facts.seen["states"][1000:1040] = ENABLED
+    facts.is_host_time = True
+    noticed_t_ns = record.noticed_t_ns(facts.fault_t_ns)
+    held_up = (facts.sync_t_ns > noticed_t_ns) & (facts.sync_t_ns < 1_040_000_000)
+    assert BEGUN in bars_missed(facts, record)
+    facts.sync_t_ns = facts.sync_t_ns[~held_up]
+    assert judge(FAULT, facts, record).begun_cycles <= 1.0
+
+
 def test_judges_see_a_stage_that_moves_again():
     facts, record = rest_after(2.0)
     facts.seen["macro_position_m"][1600:] += 30e-6
@@ -422,16 +433,18 @@ def test_a_fault_that_never_struck_shows_nothing():
 
 def test_the_seeded_part_has_those_that_must_stop_of_kinds_that_may_go_by():
     drawn = [campaign.drawn(seed) for seed in range(RUNS)]
-    either = ("encoder glitch", "interferometer silent", "host overrun", "supervisor hangs")
+    either = ("statusword stuck", "encoder glitch", "interferometer silent", "host overrun", "supervisor hangs")
     assert {kind for kind, _, fault, _ in drawn if kind in either and fault.must_stop} == set(either)
-    assert {phase for kind, phase, *_ in drawn if kind == "obstacle (following error)"} >= {"constant speed"}
+    assert {phase for kind, phase, *_ in drawn if kind == "obstacle"} >= {"constant speed"}
     assert "jogging" in {phase for kind, phase, *_ in drawn if kind == "client vanishes"}
     many = [campaign.drawn(seed) for seed in range(900)]
     for one in either:
         musts = [fault.must_stop for kind, _, fault, _ in many if kind == one]
         assert 0.25 < sum(musts) / len(musts) < 0.75
-    phases = [phase for kind, phase, *_ in many if kind == "obstacle (following error)"]
+    phases = [phase for kind, phase, *_ in many if kind == "obstacle"]
     assert set(phases) == set(PHASES)
+    fallen_behind = [fault.must_stop for kind, _, fault, _ in many if kind == "following error"]
+    assert sum(fallen_behind) >= 5
     vanished = [phase for kind, phase, *_ in many if kind == "client vanishes"]
     assert sum(phase == "jogging" for phase in vanished) >= 0.5 * len(vanished)
 

@@ -13,7 +13,7 @@ from sim_backend.rig import Rig
 from stagectl.errors import ProfileError
 
 MS = 1_000_000
-MACRO = 1
+MACRO, MICRO = 1, 2
 
 
 @pytest.fixture
@@ -119,6 +119,15 @@ def test_an_edge_wears_and_an_obstacle_stands_in_the_way(rig):
     assert rig.plant_state()["macro_position_m"] > at_m - 3e-3  # 4 mm without it
     rig.advance(rig.t_ns + 20 * MS)
     assert float(rig._plant_parameters["travel_low_m"][0]) == -0.5
+
+
+def test_a_weak_motor_gives_a_part_of_its_force_for_a_while(rig):
+    whole = float(rig._plant_parameters["micro_force_constant_n_per_a"][0])
+    inject(rig, kind="weak_motor", node_id=MICRO, force_ratio=0.25, duration_s=0.05)
+    rig.advance(rig.t_ns + 10 * MS)
+    assert float(rig._plant_parameters["micro_force_constant_n_per_a"][0]) == pytest.approx(0.25 * whole)
+    rig.advance(rig.t_ns + 60 * MS)
+    assert float(rig._plant_parameters["micro_force_constant_n_per_a"][0]) == pytest.approx(whole)
 
 
 @pytest.mark.parametrize(

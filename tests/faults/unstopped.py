@@ -44,7 +44,8 @@ def astray(
         true_m = np.interp(t_ns, seen["t_ns"], seen["end_position_m"])
         error_m = true_m - setpoint_m
         error_m = np.abs(error_m[rows] - error_m[np.flatnonzero(begins)[0]])  # the reference has its own zero
-        limit_m = of.error_limit_m + facts.planned_m_per_s * (NOTICED_S + facts.late_s)
+        end_m_per_s = float(np.abs(seen["end_velocity_m_per_s"][at:end]).max(initial=0.0))
+        limit_m = of.error_limit_m + max(facts.planned_m_per_s, end_m_per_s) * (NOTICED_S + facts.late_s)
         limit_m += 0.5 * of.drift_m_per_s2 * blind_s**2
         worst_m = float(error_m.max(initial=0.0))
         if not worst_m <= limit_m:
