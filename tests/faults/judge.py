@@ -23,8 +23,8 @@ most the rest of its greatest force, F / m - w^2 e at e from its goal, and throw
 a spring, no command: only forward travel is judged until the obstacle is gone and the loop stands, by the same bound;
 from there on the macro must stand as after any fault. A drive whose encoder jumps goes with it, there and back, with
 that overshoot: it holds on nothing else. By how much more such an encoder misleads its ramp is no excuse. An end that
-swings, as its motor is too weak to hold it, pulls at a drive that settles as long as that lasts: all of its 0.2 mm
-may come on top then.
+swings, as its motor is too weak to hold it, strikes its stops as long as that lasts: each time an elastic blow of it
+gives the macro a speed, which over the bandwidth of the drive's loop is how far it may go on top.
 
 A motion that no fault stops, or none has stopped yet, is judged in `unstopped.py`; a stop that the operator asked for
 by the same bound with the law's ramp. Behind the acknowledgement nothing may move or get power until it is asked for.
@@ -70,9 +70,9 @@ NONSENSE = "nonsense taken for a profile, or refused unclearly"
 BARS = (TRAVEL, STRUCK, LIMP, STANDSTILL, BEGUN, LOST, UNREADABLE, STRANGER, BACK, COURSE, NONSENSE)
 """What a run can miss."""
 GENTLE = (
-    "and 20 um, 0.2 mm where the end swings; a: the greatest gain of speed until it was noticed, at most a plan's; "
-    "behind an obstacle forward only, and back by its drive's overshoot; of an encoder that jumps 1.2 times that; "
-    "of a deaf drive from its own watch on"
+    "and 20 um; a: the greatest gain of speed until it was noticed, at most a plan's; behind an obstacle forward only, "
+    "and back by its drive's overshoot; of an encoder that jumps 1.2 times that; of an end that swings what its blow "
+    "gives; of a deaf drive from its own watch on"
 )
 """Where the bound differs from v t + a t^2 / 2 + (v + a t)^2 / (2 ramp) with what was true at the fault."""
 
@@ -186,8 +186,11 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         shifted_m = (1.0 + OVERSHOOT) * drawn.encoder_m
         back_m = shifted_m
         free = min(int(np.searchsorted(t_ns, facts.fault_t_ns + round(1e9 * drawn.lasts_s))), end)
+        struck_m = 0.0
         if drawn.swings:
             stands = min(max(stands, free + SETTLED_SAMPLES), end)
+            relative = seen["end_velocity_m_per_s"][at:stands] - velocity[at:stands]
+            struck_m = of.struck_m(float(np.abs(relative).max(initial=0.0)))
         if drawn.pushed:
             stands = min(max(stands, free + RELEASED_SAMPLES), end)
             away_m = (position[at:stands] - position[at]) * np.sign(velocity[at])
@@ -203,7 +206,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             bound_m = back_m + _bound_m(t_ns, velocity, at, detection_s + facts.late_s, of, drawn.open_loop)
         if MICRO in drawn.without_power:
             found += _too_far(seen, at, stands, of)
-        if not travel_m <= bound_m + (SETTLING_M if drawn.swings else STANDSTILL_M):
+        if not travel_m <= bound_m + struck_m + STANDSTILL_M:
             found.append((TRAVEL, f"macro went {travel_m * 1e3:.3f} mm, bound {bound_m * 1e3:.3f} mm"))
         if rest is None and not dark:
             found.append((STANDSTILL, "it never stood still"))
@@ -214,7 +217,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         held_m, drift_m = _moved_after(seen, stands, end)
         if rest is not None and not drawn.pushed:
             settled_m = float(np.abs(position[rest:stands] - position[rest]).max(initial=0.0))
-            if settled_m > SETTLING_M + shifted_m:
+            if settled_m > SETTLING_M + shifted_m + struck_m:
                 found.append((STANDSTILL, f"macro moved {settled_m * 1e6:.0f} um while it settled"))
         if held_m > STANDSTILL_M + shifted_m:
             found.append((STANDSTILL, f"macro moved {held_m * 1e6:.0f} um after standstill, with power"))

@@ -54,6 +54,14 @@ class Mechanics:
         told_kg = drive["mass_per_constant"] * self.machine.macro.force_constant_n_per_a
         return float(self.force_limit_n / (told_kg * drive["bandwidth_rad_per_s"] ** 2))
 
+    def struck_m(self, relative_m_per_s: float) -> float:
+        """How far the macro's drive gives way when the end strikes its stop so fast: speed by the drive's bandwidth."""
+        macro, micro = self.machine.macro, self.machine.micro
+        if micro is None:
+            return 0.0
+        gained_m_per_s = 2.0 * micro.mass_kg / (micro.mass_kg + macro.mass_kg) * relative_m_per_s
+        return float(gained_m_per_s / drive_servo.parameters(macro)[0]["bandwidth_rad_per_s"])
+
     @property
     def kick_m_per_s(self) -> float:
         """How much faster the macro gets by its greatest force in a cycle, as one frame that is not the law's asks."""

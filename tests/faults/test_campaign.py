@@ -25,7 +25,7 @@ from tests.faults.kinds import KINDS, MACRO, MICRO, PHASES, SILENCE_S, Drawn
 from tests.faults.limp import shorted_way_m
 from tests.faults.mechanics import mechanics_of
 from tests.faults.nonsense import nonsense
-from tests.faults.scene import Facts
+from tests.faults.scene import PROFILE, Facts
 from tests.faults.witness import ENABLED
 
 SEEDS = (8, 12, 46, 162, 183, 230)
@@ -141,6 +141,17 @@ def test_judges_see_a_drive_that_goes_on_after_detection():
     facts, record = rest_after(2.0)
     facts.seen["states"][1000:1040] = ENABLED
     assert BEGUN in bars_missed(facts, record)
+
+
+def test_an_end_that_swings_gives_the_macro_its_blow_and_no_more():
+    swings = replace(FAULT, swings=True, lasts_s=0.5)
+    given_m = mechanics_of(PROFILE).struck_m(0.2)
+    assert given_m == pytest.approx(2.0 * 39.6 / (39.6 + 70.7) * 0.2 / (2.0 * np.pi * 20.0), rel=1e-3)
+    for way_m, missed in ((0.9 * given_m, set()), (5e-3, {TRAVEL, STANDSTILL})):
+        facts, record = rest_after(2.0)
+        facts.seen["end_velocity_m_per_s"][1250] += 0.2
+        facts.seen["macro_position_m"][1300:1400] += way_m * np.sin(np.linspace(0.0, np.pi, 100))
+        assert bars_missed(facts, record, swings) == missed
 
 
 def test_on_a_host_that_keeps_no_time_cycles_are_counted_by_sync():
