@@ -185,7 +185,7 @@ def test_shipped_gains_keep_the_margins_of_the_rules(name):
     assert found.stable_with_other_mass
 
 
-@pytest.mark.parametrize("began_with_hz", [None, 50.0, 1.0])
+@pytest.mark.parametrize("began_with_hz", [None, 50.0])
 def test_the_gain_of_the_stage_at_100_hz_is_what_tune_finds_at_that_rate(began_with_hz):
     """Wherever the search begins; it ends within 0.6 % of the greatest bandwidth that keeps the margins."""
     profile = load_profile(GUEST / "stage-100hz.toml")
