@@ -22,6 +22,7 @@ from tests.service.test_stage_loop import Bench
 from tests.toml_text import changed
 
 MOVE_M = 0.01
+TRIES_COUNT = 5
 
 
 class Watched(BatchBackend):
@@ -103,6 +104,23 @@ def test_the_rig_plays_one_part_and_hardware_the_other(played, tmp_path):
         assert set(drives.values()) == {"SWITCH_ON_DISABLED"}
 
 
+def home_arm_and_move(stage, backend):
+    """Return the first outcome that is no success, the move's where all is well; and where the stage was before it.
+
+    A host that starves the servo for more than 20 cycles has the rig's drives say so: that gets another try.
+    """
+    for _ in range(TRIES_COUNT):
+        for ask in (stage.home, stage.armed, lambda: stage.move(stage.status()["setpoint_position_m"] + MOVE_M)):
+            began = backend.request({"state": True})["plant"]
+            outcome = ask()
+            if not outcome.finished:
+                break
+        if outcome.stop is not Stop.EMERGENCY:
+            break
+        stage.acknowledge()
+    return outcome, began
+
+
 @pytest.mark.real_time
 def test_simulated_drives_home_and_move_by_a_real_interferometer_that_sees_what_they_move(played, tmp_path):
     """Its port is a link that is laid to the sensor of the machine that these drives move, once that is there."""
@@ -115,14 +133,12 @@ def test_simulated_drives_home_and_move_by_a_real_interferometer_that_sees_what_
     assert missing(profile, RIG_DRIVES, tmp_path) == ""
     with Supervisor(profile, backend, tmp_path / "run") as stage:
         assert f"real interferometer {port}" in backend.description
-        assert stage.home().stop is Stop.FINISHED
-        assert stage.armed().stop is Stop.FINISHED
-        began_m = backend.request({"state": True})["plant"]["end_position_m"]
-        target_m = float(stage.status()["setpoint_position_m"]) + MOVE_M
-        assert stage.move(target_m).stop is Stop.FINISHED
-        moved_m = backend.request({"state": True})["plant"]["end_position_m"] - began_m
+        outcome, began = home_arm_and_move(stage, backend)
+        assert outcome.stop is Stop.FINISHED, outcome
+        moved_m = backend.request({"state": True})["plant"]["end_position_m"] - began["end_position_m"]
         assert moved_m == pytest.approx(MOVE_M, abs=1e-4)
-        assert stage.status()["end_position_m"] == pytest.approx(target_m, abs=1e-4)
+        status = stage.status()
+        assert status["end_position_m"] == pytest.approx(status["setpoint_position_m"], abs=1e-4)
         stage.disarm()
 
 
@@ -132,15 +148,13 @@ def test_simulated_drives_are_stopped_where_the_real_interferometer_does_not_see
     profile = load_profile(played[1])
     backend = RigBackend(profile, "single-axis", seed=4, plays=RIG_DRIVES)
     with Supervisor(profile, backend, tmp_path / "run") as stage:
-        assert stage.home().stop is Stop.FINISHED  # the drive looks for its index by its own encoder
-        assert stage.armed().stop is Stop.FINISHED
-        began_m = backend.request({"state": True})["plant"]["macro_position_m"]
-        outcome = stage.move(float(stage.status()["setpoint_position_m"]) + MOVE_M)
+        outcome, began = home_arm_and_move(stage, backend)  # homing is by the drive's own encoder
+        assert outcome.name.startswith("moving to"), outcome
         assert outcome.stop is Stop.REFERENCE_LOST, outcome
         assert "macro laser and the drive's encoder differ" in outcome.detail
         plant = backend.request({"state": True})["plant"]
         assert abs(plant["macro_velocity_m_per_s"]) < REST_M_PER_S
-        assert abs(plant["macro_position_m"] - began_m) < 0.1 * MOVE_M
+        assert abs(plant["macro_position_m"] - began["macro_position_m"]) < 0.1 * MOVE_M
 
 
 BODIES = {
