@@ -31,9 +31,11 @@ class Reports:
             return made
         kept = self._folder / f"{name}.html"
         async with self._lock:
-            # A run that closes gets a new manifest, and its folder a new time.
-            if not kept.is_file() or kept.stat().st_mtime < run.stat().st_mtime:
+            # A run that closes gets a new manifest, and its folder a new time; it may close while it is drawn.
+            run_ns = run.stat().st_mtime_ns
+            if not kept.is_file() or kept.stat().st_mtime_ns != run_ns:
                 await self._draw(run, kept)
+                os.utime(kept, ns=(run_ns, run_ns))
         return kept
 
     async def _draw(self, run: Path, target: Path) -> None:

@@ -157,7 +157,6 @@ class StageWorld(StageState):
         stage, self._stage, self._wear = self._stage, None, None
         self._homed = False
         self.desk.profile = None
-        self._figures.begin_servo()
         if stage is not None:
             self._opening = False
             self._notifier.allow(_CLOSE_S)
@@ -168,6 +167,7 @@ class StageWorld(StageState):
             give_back(stage.folder)
             self._recording.forget()
             self._notifier.allow(0.0)
+        self._figures.begin_servo()  # closing brings the last rows, and what they count was counted before
         if states.TRANSITIONS.get((self._state, Event.LET_GO)) is not None and self._state is not State.FAULT:
             self._enter(Event.LET_GO)
 

@@ -25,7 +25,8 @@ class PageServer:
         self.address = f"http://127.0.0.1:{self.port}"
         self.sessions = Sessions()
         self._drawn = tempfile.TemporaryDirectory()
-        served = application(socket_path, Reports(runs, Path(self._drawn.name)))
+        self.drawn = Path(self._drawn.name)
+        served = application(socket_path, Reports(runs, self.drawn))
         admission = Admission(served, self.sessions, self.port)
         self._listener = Listener([(listening, admission)], lifespan="on", from_operator=admission.is_from_operator)
         self._listener.start()

@@ -1,11 +1,13 @@
-"""Figures for Prometheus that are worked out here: the load of the bus, and what is known of the joint."""
+"""Figures for Prometheus that are worked out here: of cycles, samples, faults, the bus, and of the joint."""
 
 import numpy as np
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from stagectl.row import new_rows
 from stagectl.service import messages
 from stagectl.service.exposition import Figures
+from tests.service.test_stage_loop import Bench
 
 
 def rows_from(first, count, every_ns=1_000_000, answers=True):
@@ -103,3 +105,114 @@ def test_temperatures_are_exposed_by_axis_and_left_out_where_none_is_known():
     ):
         assert line in lines
     assert "temperature" not in Figures().exposition(STATUS).decode()
+
+
+def scraped(figures):
+    """What a scraper finds: values by name and, where there is one, label."""
+    families = text_string_to_metric_families(figures.exposition(STATUS).decode())
+    samples = [sample for family in families for sample in family.samples]
+    return {(one.name, *one.labels.values()): one.value for one in samples}
+
+
+def buckets(found, name):
+    """The counts of a histogram by their bounds in seconds."""
+    return {float(key[1]): value for key, value in found.items() if key[0] == f"{name}_bucket"}
+
+
+def cycles_of(lateness_ns, age_ns, missed, lost, refused):
+    """Rows of one servo, from its first."""
+    rows = rows_from(1000, len(lateness_ns))
+    rows["lateness_ns"] = lateness_ns
+    rows["sample_t_ns"] = [0 if age is None else t_ns - age for t_ns, age in zip(rows["t_ns"], age_ns, strict=True)]
+    rows["cycles_missed"], rows["samples_lost"], rows["command_lost"] = missed, lost, refused
+    return rows
+
+
+FIRST = cycles_of(
+    lateness_ns=[-5_000, 15_000, 20_000, 150_000, 3_000_000, 60_000_000],
+    age_ns=[None, None, 250_000, 450_000, 800_000, 60_000_000],
+    missed=[0, 0, 0, 1, 1, 3],
+    lost=[0, 2, 2, 2, 7, 7],
+    refused=[0, 0, 1, 1, 0, 0],
+)
+SECOND = cycles_of(
+    lateness_ns=[1_000, 1_500_000, 1_000], age_ns=[250_000] * 3, missed=[0, 2, 2], lost=[1, 1, 1], refused=[0, 0, 1]
+)
+
+
+def test_cycles_and_samples_are_counted_over_all_servos(oled_profile):
+    """Those in the rows begin at 0 with each servo; a counter that falls says that the service began anew."""
+    figures, names = Figures(), ("cycles", "cycles_missed", "samples_lost", "commands_refused")
+
+    def counts():
+        found = scraped(figures)
+        return tuple(found[f"stagectl_{name}_total",] for name in names)
+
+    assert counts() == (0, 0, 0, 0)
+    figures.begin_servo(oled_profile)
+    seen = []
+    for rows in (FIRST[:1], FIRST[1:4], FIRST[4:4], FIRST[4:]):
+        figures.add(rows)
+        seen.append(counts())
+    assert seen == [(1, 0, 0, 0), (4, 1, 2, 2), (4, 1, 2, 2), (6, 3, 7, 2)]
+    figures.begin_servo()
+    assert counts() == seen[-1]
+    figures.begin_servo(oled_profile)
+    assert counts() == seen[-1]
+    figures.add(SECOND[:1])
+    assert counts() == (7, 3, 8, 2)
+    figures.add(SECOND[1:])
+    assert counts() == (9, 5, 8, 3)
+
+
+def test_lateness_and_age_of_samples_are_histograms_over_all_servos(oled_profile):
+    figures = Figures()
+    for rows in (FIRST, SECOND):
+        figures.begin_servo(oled_profile)
+        figures.add(rows)
+    found = scraped(figures)
+    late = {1e-5: 3, 2e-5: 5, 5e-5: 5, 1e-4: 5, 2e-4: 6, 5e-4: 6, 1e-3: 6, 2e-3: 7, 5e-3: 8, 1e-2: 8, 2e-2: 8, 5e-2: 8}
+    assert buckets(found, "stagectl_cycle_lateness_seconds") == late | {np.inf: 9}
+    assert found["stagectl_cycle_lateness_seconds_count",] == 9
+    on_time_is_zero_s = 15e-6 + 20e-6 + 150e-6 + 3e-3 + 60e-3 + 1e-6 + 1.5e-3 + 1e-6
+    assert found["stagectl_cycle_lateness_seconds_sum",] == pytest.approx(on_time_is_zero_s, rel=1e-9)
+    old = {2e-4: 0, 3e-4: 4, 4e-4: 4, 5e-4: 5, 7e-4: 5, 1e-3: 6, 2e-3: 6, 3e-3: 6, 5e-3: 6, 1e-2: 6, 2e-2: 6, 5e-2: 6}
+    assert buckets(found, "stagectl_sample_age_seconds") == old | {np.inf: 7}
+    of_known_s = 4 * 250e-6 + 450e-6 + 800e-6 + 60e-3
+    assert found["stagectl_sample_age_seconds_sum",] == pytest.approx(of_known_s, rel=1e-9)
+
+
+def test_faults_are_counted_by_kind():
+    figures = Figures()
+    assert "stagectl_faults_total" not in {name for name, *_ in scraped(figures)}
+    for kind in ("LEASE", "EMERGENCY", "LEASE"):
+        figures.fault(kind)
+    found = scraped(figures)
+    assert {key[1]: value for key, value in found.items() if key[0] == "stagectl_faults_total"} == {
+        "LEASE": 2,
+        "EMERGENCY": 1,
+    }
+
+
+def test_what_a_servo_missed_is_counted_once_where_its_stage_is_let_go_of(tmp_path):
+    """Its last rows come while it is closed."""
+    bench = Bench(tmp_path)
+    bench.until(lambda: bench.loop._state == "idle")
+    observe = bench.loop._stage._observe
+
+    def behind(rows):
+        rows = rows.copy()
+        rows["cycles_missed"], rows["samples_lost"] = 3, 7
+        observe(rows)
+
+    bench.loop._stage._observe = behind
+    bench.loop.step()
+    bench.loop.step()
+    before = scraped(bench.figures)
+    assert (before["stagectl_cycles_missed_total",], before["stagectl_samples_lost_total",]) == (3, 7)
+    bench.loop.leave()
+    bench.loop.run()
+    after = scraped(bench.figures)
+    assert after["stagectl_cycles_total",] > before["stagectl_cycles_total",]
+    assert (after["stagectl_cycles_missed_total",], after["stagectl_samples_lost_total",]) == (3, 7)
+    assert bench.figures.recent_lateness_s() is None

@@ -3,20 +3,27 @@
 import asyncio
 import contextlib
 import json
+import os
 import signal
 import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import httpx
 import pytest
 import websockets
 
 from stagectl.page.admission import ENTRY, KEY_HEADER, Sessions
+from stagectl.record import MANIFEST
+from stagectl.service import messages
 from stagectl.service.access import Role
 from stagectl.service.admission import CONNECTIONS_LIMIT
+from stagectl.whole_file import replace_whole
 from tests.service.pages import PageServer
+from tests.service.test_stage_loop import Bench
 
 pytestmark = pytest.mark.real_time
 
@@ -205,6 +212,120 @@ def test_pages_carry_a_policy_and_reports_come_from_the_runs_folder_only(page, d
         assert broken.status_code == 404
         assert "no report" in broken.text
         made.rmdir()
+
+
+class ReportOf:
+    """The report of one recorded run, asked for as the run list does."""
+
+    def __init__(self, page, name):
+        self._page, self._name = page, name
+        self.kept = page.drawn / f"{name}.html"
+
+    def get(self):
+        with self._page.browser(Role.OBSERVE) as browser:
+            return browser.get(f"/runs/{self._name}/report")
+
+    def stamp(self):
+        """What is another where it was written again."""
+        found = self.kept.stat()
+        return found.st_ino, found.st_mtime_ns
+
+
+def drawing_pid():
+    """The process that draws for this one, where there is one that has begun to."""
+    for thread in Path("/proc/self/task").iterdir():
+        for child in (thread / "children").read_text().split():
+            with contextlib.suppress(OSError):
+                words = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
+                if words[0] == sys.executable.encode() and b"plot" in words:
+                    return int(child)
+    return None
+
+
+def until_drawing():
+    give_up_s = time.monotonic() + 60.0
+    while (pid := drawing_pid()) is None:
+        assert time.monotonic() < give_up_s, "nothing is drawn"
+        time.sleep(0.001)
+    return pid
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """The folder of a run that the service recorded in virtual time: armed, moved, stopped."""
+    bench = Bench(tmp_path)
+    bench.hold_as_homed_by_truth()
+    moved = bench.do("move", messages.Move(target_m=0.01))
+    assert moved.stop == "FINISHED"
+    bench.loop.leave()
+    bench.loop.run()
+    return Path(moved.run)
+
+
+@pytest.fixture
+def reports(daemon, recorded):
+    server = PageServer(daemon.socket, recorded.parent)
+    yield ReportOf(server, recorded.name)
+    server.end()
+
+
+def newer_manifest(run, content, description):
+    """Give a run a newer manifest than `content`, as its end does, or what saves it."""
+    replace_whole(run / MANIFEST, json.dumps(json.loads(content) | {"backend_description": description}).encode())
+
+
+def pipe_to_reader(path):
+    """Wait until somebody reads a named pipe, and return the file to write to."""
+    descriptor, give_up_s = None, time.monotonic() + 60.0
+    while descriptor is None:
+        assert time.monotonic() < give_up_s, "nobody reads it"
+        with contextlib.suppress(OSError):  # ENXIO until then
+            descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
+        time.sleep(0.001)
+    os.set_blocking(descriptor, True)
+    return open(descriptor, "wb")
+
+
+def test_a_recorded_run_s_report_is_drawn_when_it_is_asked_for_kept_and_drawn_anew_for_a_newer_manifest(
+    reports, recorded
+):
+    with ThreadPoolExecutor() as asking:
+        answer = asking.submit(reports.get)
+        assert os.getpriority(os.PRIO_PROCESS, until_drawing()) == 19
+        drawn = answer.result(120.0)
+    assert drawn.status_code == 200, drawn.text
+    assert drawn.headers["content-security-policy"].endswith("sandbox")
+    assert recorded.name in drawn.text
+    assert "<svg" in drawn.text
+    assert "Timing" in drawn.text
+    assert not (recorded / "report.html").exists()  # a page need not be let write there
+    stamp = reports.stamp()
+    assert reports.get().text == drawn.text
+    assert reports.stamp() == stamp
+    newer_manifest(recorded, (recorded / MANIFEST).read_bytes(), "a world of another name")
+    anew = reports.get()
+    assert "a world of another name" in anew.text
+    assert "a world of another name" not in drawn.text
+    assert reports.stamp() != stamp
+    stamp = reports.stamp()
+    assert reports.get().text == anew.text
+    assert reports.stamp() == stamp
+
+
+def test_a_run_that_closes_while_its_report_is_drawn_is_drawn_anew_when_it_is_asked_for_again(reports, recorded):
+    """Drawing takes seconds on a busy host; what was read before them is not what the run says since."""
+    content = (recorded / MANIFEST).read_bytes()
+    (recorded / MANIFEST).unlink()
+    os.mkfifo(recorded / MANIFEST)
+    with ThreadPoolExecutor() as asking:
+        answer = asking.submit(reports.get)
+        with pipe_to_reader(recorded / MANIFEST) as read_now:
+            newer_manifest(recorded, content, "a world that was closed since")
+            read_now.write(content)
+        before = answer.result(120.0)
+    assert before.status_code == 200, before.text
+    assert "a world that was closed since" not in before.text
+    assert "a world that was closed since" in reports.get().text
 
 
 def test_ten_pages_are_one_client_of_the_service(page):

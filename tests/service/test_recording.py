@@ -403,6 +403,52 @@ def test_a_run_is_as_old_as_services_were_there_whatever_the_clock_says(tmp_path
     assert later.exists()
 
 
+@pytest.mark.parametrize(
+    ("record", "made", "gone", "because"),
+    [
+        (
+            {"size_limit_bytes": 2_000_000},
+            {"2026-01-01-oldest": (50.0, 900_000), "2026-01-01-old": (40.0, 900_000), "2026-01-01-new": (1.0, 900_000)},
+            "2026-01-01-oldest",
+            "all runs of the service take 0.003 GB, limit 0.002",
+        ),
+        (
+            {"age_limit_s": DAY_S},
+            {"2026-01-01-old": (2.0 * DAY_S, 1000), "2026-01-01-new": (0.5 * DAY_S, 1000)},
+            "2026-01-01-old",
+            "2.0 days old, limit 1",
+        ),
+    ],
+    ids=["size", "age"],
+)
+def test_the_service_keeps_its_runs_within_the_profile_s_limits_and_says_what_it_removes(
+    tmp_path, record, made, gone, because
+):
+    path = tmp_path / "mine.toml"
+    path.write_text(changed(PROFILES_FOLDER / "single-axis.toml", {"record": record}))
+    bench = Bench(tmp_path, profile=str(path))
+    root = bench.settings.runs_root
+    for name, (age_s, size_bytes) in made.items():
+        made_run(root, name, age_s, size_bytes)
+    bench.until(lambda: bench.loop._state == "idle")
+    assert {folder.name for folder in root.glob("2026-01-01-*")} == set(made)
+    working = threading.Thread(target=bench.loop.run)
+    working.start()
+
+    def said():
+        return [entry for entry in bench.log.last(1000) if entry.event == "run_removed"]
+
+    try:
+        give_up_s = time.monotonic() + 20.0
+        while not said() and time.monotonic() < give_up_s:
+            time.sleep(0.01)
+    finally:
+        bench.loop.leave()
+        working.join(60.0)
+    assert [(entry.text, entry.fields) for entry in said()] == [(because, {"run": gone})]
+    assert {folder.name for folder in root.glob("2026-01-01-*")} == set(made) - {gone}
+
+
 @pytest.fixture
 def bench(tmp_path):
     path = tmp_path / "mine.toml"

@@ -1,6 +1,7 @@
 """The stage's thread on the rig in virtual time: faults, what leads out of them, refusals, worlds that are missing."""
 
 import os
+import socket
 import threading
 import time
 
@@ -670,3 +671,53 @@ def test_a_profile_edited_to_nonsense_changes_nothing(tmp_path):
     assert bench.desk.profile.macro.velocity_limit_m_per_s == 0.05
     bench.loop.leave()
     bench.loop.run()
+
+
+class Manager:
+    """systemd's end of a bench whose watchdog may be fed at each step."""
+
+    def __init__(self, bench, folder, monkeypatch):
+        self._bench, self._now_s = bench, 0.0
+        self._heard = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self._heard.bind(str(folder / "notify"))
+        environment = {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000"}
+        monkeypatch.setattr(bench.loop, "_notifier", Notifier(environment, lambda: self._now_s))
+
+    def fed_count(self, steps_count):
+        """Have the loop go on, a second a step, and return how often it fed the watchdog."""
+        for _ in range(steps_count):
+            self._now_s += 1.0
+            self._bench.loop.step()
+        said = []
+        while True:
+            try:
+                said.append(self._heard.recv(4096).decode())
+            except BlockingIOError:
+                return said.count("WATCHDOG=1")
+
+    def close(self):
+        self._heard.close()
+
+
+def test_the_watchdog_is_fed_while_the_servo_of_an_open_stage_does_cycles_and_only_then(bench, tmp_path, monkeypatch):
+    """A service whose own loop goes on beside a servo that hangs is to be started again."""
+    manager = Manager(bench, tmp_path, monkeypatch)
+    assert manager.fed_count(5) == 5
+    with monkeypatch.context() as frozen:
+        frozen.setattr(bench.loop._stage.link, "pass_time", lambda duration_s: None)
+        bench.loop.step()
+        cycles_count = bench.status.health.cycles_count
+        manager.fed_count(1)  # of the last cycles
+        assert manager.fed_count(20) == 0
+        assert (bench.status.state, bench.status.health.cycles_count) == ("idle", cycles_count)
+    manager.fed_count(1)
+    assert manager.fed_count(5) == 5
+    manager.close()
+
+
+def test_the_watchdog_is_fed_by_the_loop_itself_while_it_waits_for_hardware(tmp_path, monkeypatch):
+    waiting = Bench(tmp_path, backend="hardware")
+    manager = Manager(waiting, tmp_path, monkeypatch)
+    assert manager.fed_count(3) >= 3
+    assert (waiting.status.state, waiting.status.health.cycles_count) == ("off", 0)
+    manager.close()
