@@ -380,8 +380,9 @@ def test_a_phone_jogs_while_a_finger_holds_moves_and_reaches_scope_and_runs(idle
     fingers.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [finger]})
     idle.state_is("moving")
     idle.until(lambda: idle.client.status().positions.end_position_m > before_m + 1e-3, "motion")
-    assert idle.client.status().state == "moving"
     fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    expect(jog).not_to_have_class(re.compile("held"))
+    expect(page.locator("#command-text")).to_have_text("jogging: done", timeout=PATIENCE_MS)
     state_is(page, "armed")
     assert stands_still(idle)
     page.fill("#target", "5")
