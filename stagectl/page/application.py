@@ -111,7 +111,8 @@ async def _lease_left_behind(socket: WebSocket) -> str:
     token = ""
     while (said := await socket.receive())["type"] != "websocket.disconnect":
         text = said.get("text") or ""
-        token = text if len(text) <= _TOKEN_MOST else ""
+        sendable = len(text) <= _TOKEN_MOST and text.isascii() and text.isprintable()  # in a header
+        token = text if sendable else ""
     return token if said.get("code") == _GOING_AWAY else ""
 
 

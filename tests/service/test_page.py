@@ -432,3 +432,42 @@ def test_the_lease_that_a_page_said_is_given_back_when_its_browser_says_that_it_
         else:
             time.sleep(0.5)
             assert daemon.client.lease_state() is not None
+
+
+HOSTILE_FRAMES = [
+    "",
+    "[" * 90,
+    "NaN",
+    '{"mode": 2}',
+    "x\r\nHost: evil.example",
+    "\u00e9\u0000\u202e",
+    "x" * 1_000_000,
+    b"\xff\x00" * 40,
+    b"\x00" * 1_000_000,
+]
+
+
+def test_nothing_else_that_an_operator_s_page_says_gives_a_lease_back_or_breaks_the_stream(page, daemon, caplog):
+    with page.browser(Role.OPERATE) as browser:
+        headers = {"Cookie": cookie_of(browser)}
+
+    async def say_and_go(frame):
+        uri = f"ws://127.0.0.1:{page.port}/v1/stream"
+        stream = await websockets.connect(uri, origin=page.address, additional_headers=headers, max_size=None)
+        with contextlib.suppress(websockets.ConnectionClosed):
+            await stream.send(frame)
+            for _ in range(2):
+                assert json.loads(await asyncio.wait_for(stream.recv(), 10.0))["status"]["state"]
+        await stream.close(1001)
+        await stream.wait_closed()
+        return stream.close_code
+
+    async def say_all():
+        return [await say_and_go(frame) for frame in HOSTILE_FRAMES]
+
+    with daemon.client.lease("a page", duration_s=5.0) as lease:
+        codes = asyncio.run(say_all())
+        assert codes == [1009 if len(frame) > 100_000 else 1001 for frame in HOSTILE_FRAMES]
+        assert heard(page, headers["Cookie"], page.address)[0]["status"]["lease"]["holder"] == "a page"
+        assert daemon.client.renew_lease().token == lease.token
+    assert [record.message for record in caplog.records if record.levelname == "ERROR"] == []

@@ -13,6 +13,7 @@ import time
 
 import pytest
 
+from stagectl.client import Client
 from stagectl.requests import TICKING, Phase
 from stagectl.service.access import Role
 from tests.service.daemon import Daemon, at_rest
@@ -104,11 +105,15 @@ def state_is(page, *states):
     expect(page.locator("#state")).to_have_attribute("data-state", re.compile("|".join(states)), timeout=PATIENCE_MS)
 
 
-def armed_page(opened, **how):
-    page = opened(Role.OPERATE, **how)
+def take_and_arm(page):
     page.click("#take")
     page.click("#arm")
     state_is(page, "armed")
+
+
+def armed_page(opened, **how):
+    page = opened(Role.OPERATE, **how)
+    take_and_arm(page)
     return page
 
 
@@ -170,10 +175,81 @@ def test_a_run_begun_and_ended_by_its_buttons_is_in_the_list(idle, opened):
     page.click("#take")
 
 
+TILES = {
+    "end": ("end_position_m", 1e3, 4),
+    "setpoint": ("setpoint_position_m", 1e3, 4),
+    "macro": ("macro_position_m", 1e3, 4),
+    "relative": ("relative_position_m", 1e6, 2),
+}
+FORCES = {
+    "macro-force": ("macro_force_n", 2),
+    "micro-force": ("micro_force_n", 3),
+    "contact": ("contact_force_estimate_n", 3),
+}
+COUNTS = {"cycles": "cycles_count", "missed": "missed_cycles_count", "lost-samples": "lost_samples_count"}
+TEXTS = """() => Object.fromEntries([...document.querySelectorAll('.readout b[id], .tile [id]')]
+    .map((one) => [one.id, one.textContent]))"""
+
+
+def rounded(value, scale, digits):
+    if value is None:
+        return "–"
+    text = f"{value * scale:.{digits}f}"
+    return text.lstrip("-") if not text.strip("-0.") else text.replace("-", "−")
+
+
+def hear_along(page):
+    """Open the page anew and hear what it hears: a list of messages that grows."""
+    heard = []
+    page.on("websocket", lambda socket: socket.on("framereceived", lambda text: heard.append(json.loads(text))))
+    page.reload()
+    return heard
+
+
+def tiles_of(heard):
+    """What the page has to show behind each of these messages."""
+    newest, found = {}, []
+    missed_at_first = heard[0]["status"]["health"]["missed_cycles_count"]
+    for message in heard:
+        positions, health = message["status"]["positions"], message["status"]["health"]
+        if rows := message["samples"]["rows"]:
+            newest = dict(zip(message["samples"]["columns"], rows[-1], strict=True))
+        powered = message["status"]["state"] not in ("off", "idle", "fault")
+        found.append(
+            {name: rounded(positions[column], scale, digits) for name, (column, scale, digits) in TILES.items()}
+            | {name: rounded(newest[column], 1.0, digits) for name, (column, digits) in FORCES.items()}
+            | {name: f"{health[column]:,}" for name, column in COUNTS.items()}
+            | {
+                "error": rounded(positions["error_m"] if powered else None, 1e6, 3),
+                "rate": f"{health['rate_hz']:.0f} Hz",
+                "missed-since": f"{health['missed_cycles_count'] - missed_at_first} since this page opened",
+                "late": f"{rounded(health['lateness_p99_s'], 1e6, 0)} µs",
+                "late-max": f"greatest {rounded(health['lateness_max_s'], 1e6, 0)} µs",
+                "discarded": f"{health['discarded_bytes_count']:,} bytes discarded",
+            }
+        )
+    return found
+
+
 def test_a_joint_identified_from_the_page_stands_there_and_says_that_it_is_worn(idle, opened):
-    page = armed_page(opened)
+    """Meanwhile every number beside it is what the service said last, forces at both edges included."""
+    page = opened(Role.OPERATE)
+    heard, shown = hear_along(page), []
+    take_and_arm(page)
     page.fill("#identify-duration", "6")
     page.click("#identify")
+    state_is(page, "identifying")
+    while page.locator("#state").get_attribute("data-state") == "identifying":
+        shown.append(page.evaluate(TEXTS))
+        page.wait_for_timeout(50)
+    expected = tiles_of(heard)
+    for one in shown:
+        assert {name: one[name] for name in expected[0]} in [
+            all_ for all_ in expected if all_["cycles"] == one["cycles"]
+        ]
+    contacts_n = [float(one["contact"].replace("−", "-")) for one in shown if one["contact"] != "–"]
+    assert min(contacts_n) < -0.1
+    assert max(contacts_n) > 0.1
     expect(page.locator("#command-text")).to_contain_text("identify: done: backlash 199.", timeout=PATIENCE_MS)
     expect(page.locator("#backlash")).to_have_text(re.compile(r"^199\.\d\d ± 0\.\d\d µm$"), timeout=PATIENCE_MS)
     expect(page.locator("#backlash-at")).to_have_text(re.compile("^(identified|production) 20"))
@@ -218,6 +294,59 @@ def test_a_page_that_hangs_in_the_middle_of_a_jog_stops_the_stage(idle, opened, 
         signal_pages(chromium, signal.SIGCONT)
 
 
+def test_missed_cycles_and_lateness_have_their_tiles_and_count_from_when_the_page_opened(idle, opened):
+    """A stage in virtual time misses no cycle: the numbers are put into what the service says."""
+    page, missed_counts = opened(Role.OBSERVE), [1227]
+
+    def pass_on(socket):
+        def send(text):
+            message = json.loads(text)
+            changed = {"lateness_p99_s": 42.4e-6, "lateness_max_s": 1.3e-3, "missed_cycles_count": missed_counts[-1]}
+            message["status"]["health"] |= changed | {"lost_samples_count": 3, "discarded_bytes_count": 12_345}
+            socket.send(json.dumps(message))
+
+        socket.connect_to_server().on_message(send)
+
+    page.route_web_socket("**/v1/stream", pass_on)
+    page.reload()
+    expect(page.locator("#missed")).to_have_text("1,227")
+    expect(page.locator("#missed-since")).to_have_text("0 since this page opened")
+    missed_counts.append(1234)
+    expect(page.locator("#missed")).to_have_text("1,234")
+    expect(page.locator("#missed-since")).to_have_text("7 since this page opened")
+    expect(page.locator("#late")).to_have_text("42 µs")
+    expect(page.locator("#late-max")).to_have_text("greatest 1300 µs")
+    expect(page.locator("#lost-samples")).to_have_text("3")
+    expect(page.locator("#discarded")).to_have_text("12,345 bytes discarded")
+
+
+def test_a_fault_says_what_to_do_and_its_acknowledgement_enables_nothing(idle, opened):
+    with Client(idle.socket) as vanishing:
+        vanishing.take_lease("who vanishes", duration_s=1.0)
+        vanishing.arm()
+    page = opened(Role.OPERATE)
+    state_is(page, "fault")
+    fault = idle.client.fault()
+    assert "the lease on motion ran out" in fault.what
+    assert "ms ago" in fault.values
+    expect(page.locator("#fault-what")).to_have_text(f"{fault.what}:")
+    expect(page.locator("#fault-values")).to_have_text(fault.values)
+    expect(page.locator("#fault-remedy")).to_have_text(f"What to do: {fault.remedy}.")
+    expect(page.locator("#fault-at")).to_have_text(re.compile(rf"^LEASE, fault {fault.number}, .+, while armed$"))
+    page.locator("#acknowledge").click(force=True)
+    expect(page.locator("#refusal")).to_have_text("Acknowledge: take the lease first")
+    assert idle.client.fault() == fault
+    page.click("#take")
+    page.click("#acknowledge")
+    state_is(page, "idle")
+    expect(page.locator("#fault")).to_be_hidden()
+    idle.until(lambda: stands_still(idle), "rest")
+    assert idle.client.fault() is None
+    states = [entry.fields["state"] for entry in idle.client.log(limit=20) if entry.event == "state"]
+    assert states[-2:] == ["fault", "idle"]
+    page.click("#take")
+
+
 def test_leaving_the_page_gives_the_lease_back(idle, opened):
     page = armed_page(opened)
     page.goto("about:blank")
@@ -237,6 +366,41 @@ def test_stop_is_in_sight_at_phone_width_wherever_one_scrolls(idle, opened):
         assert box["height"] >= 44.0
         hit = "([x, y]) => document.elementFromPoint(x, y).id"
         assert page.evaluate(hit, [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]) == "stop"
+    page.tap("#stop")
+    state_is(page, "idle")
+
+
+def test_a_phone_jogs_while_a_finger_holds_moves_and_reaches_scope_and_runs(idle, opened):
+    page = armed_page(opened, viewport=PHONE, has_touch=True, is_mobile=True)
+    fingers = page.context.new_cdp_session(page)
+    jog = page.locator("#jog-right")
+    jog.evaluate("one => one.scrollIntoView({ block: 'center' })")
+    box = jog.bounding_box()
+    finger = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    assert page.evaluate("({x, y}) => document.elementFromPoint(x, y).id", finger) == "jog-right"
+    before_m = idle.client.status().positions.end_position_m
+    fingers.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [finger]})
+    idle.state_is("moving")
+    idle.until(lambda: idle.client.status().positions.end_position_m > before_m + 1e-3, "motion")
+    fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    expect(jog).not_to_have_class(re.compile("held"))
+    expect(page.locator("#command-text")).to_have_text("jogging: done", timeout=PATIENCE_MS)
+    state_is(page, "armed")
+    assert stands_still(idle)
+    page.fill("#target", "5")
+    page.tap("#move")
+    expect(page.locator("#command-text")).to_have_text("move: done", timeout=PATIENCE_MS)
+    assert idle.client.status().positions.end_position_m == pytest.approx(0.005, abs=1e-4)
+    for place in ("#plots", "#hold", "#save", ".scroll:has(#runs)", "#runs-refresh"):
+        one = page.locator(place)
+        one.scroll_into_view_if_needed()
+        box = one.bounding_box()
+        assert 0.0 <= box["x"] < box["x"] + box["width"] <= PHONE["width"], place
+        assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    page.tap("#hold")
+    expect(page.locator("#trigger-state")).to_have_text("held")
+    row = page.locator("#runs tbody tr").first
+    expect(row).to_be_visible()
     page.tap("#stop")
     state_is(page, "idle")
 
@@ -271,10 +435,50 @@ def test_hold_and_zoom_keep_the_picture_and_let_it_go(idle, opened):
 
 def saved_samples(page):
     """Return what the scope shows, one dictionary a sample; a value that isn't known is empty."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")  # drawn
     with page.expect_download() as saved:
         page.click("#save")
     with open(saved.value.path()) as file:
         return list(csv.DictReader(file))
+
+
+def ends_s(samples):
+    """When the first and the last of these samples were."""
+    return [float(samples[at]["t_s"]) for at in (0, -1)]
+
+
+def test_zoom_keeps_the_middle_what_is_dragged_over_or_what_is_under_the_pointer(idle, opened):
+    """A picture begins and ends with a sample beyond its edge, where there is one: by 10 ms each."""
+    page = opened(Role.OBSERVE)
+    page.select_option("#window", "2")
+    page.click("#hold")
+    expect(page.locator("#trigger-state")).to_have_text("held")
+    whole = saved_samples(page)
+    from_s, until_s = ends_s(whole)
+    assert until_s - from_s == pytest.approx(2.0, abs=0.03)
+
+    def shows(from_share, until_share):
+        shown = saved_samples(page)
+        assert all(one in whole for one in (shown[0], shown[-1]))
+        expected_s = [from_s + share * (until_s - from_s) for share in (from_share, until_share)]
+        assert ends_s(shown) == pytest.approx(expected_s, abs=0.03)
+
+    page.click("#zoom-in")
+    shows(0.25, 0.75)
+    page.click("#zoom-out")
+    shows(0.0, 1.0)
+    plot = page.locator("#plots .u-over").first
+    width = plot.bounding_box()["width"]
+    plot.hover(position={"x": 0.2 * width, "y": 40})
+    page.mouse.down()
+    plot.hover(position={"x": 0.6 * width, "y": 40})
+    page.mouse.up()
+    shows(0.2, 0.6)
+    plot.hover(position={"x": 0.25 * width, "y": 40})  # 0.3 of the whole
+    page.mouse.wheel(0, -100)
+    shows(0.3 - 0.1 * 0.8, 0.3 + 0.3 * 0.8)
+    page.click("#zoom-reset")
+    assert saved_samples(page) == whole
 
 
 def test_a_trigger_holds_the_picture_around_the_event(idle, opened):
@@ -297,7 +501,6 @@ def test_a_trigger_holds_the_picture_around_the_event(idle, opened):
     move(20)
     expect(chip).to_have_text("triggered", timeout=PATIENCE_MS)
     expect(page.locator("#hold")).to_have_text("Next")
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")  # drawn
     shot = saved_samples(page)
     times_s = [float(one["t_s"]) for one in shot]
     setpoints_m = [float(one["setpoint_position_m"]) for one in shot]
