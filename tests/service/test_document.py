@@ -23,6 +23,7 @@ from stagectl.service.api import application
 from stagectl.service.listener import Listener
 from stagectl.service.places import listen_tcp
 from tests.service.test_stage_loop import Bench
+from tests.struck_stage import home_by_truth
 
 load_all_checks()
 _NAMES = (
@@ -159,9 +160,13 @@ class Operated:
         if bench.desk.lease_state() is None:  # it was given back
             bench.take()
         bench.desk.renew_lease(bench.token)
-        if bench.status.state == "idle":
-            assert bench.do("arm", messages.Arm()).stop == "FINISHED"
         plant = self._stage.backend.rig.plant_state()
+        if bench.status.state == "idle":
+            if not bench.loop._homed:  # a homing was asked for, and took longer
+                home_by_truth(self._stage, plant)
+                bench.loop._homed = True
+            assert bench.do("arm", messages.Arm()).stop == "FINISHED"
+            plant = self._stage.backend.rig.plant_state()
         self._zero_m = plant["macro_position_m"] - float(self._stage.status()["macro_position_m"])  # of the last homing
         self._begun_t_ns = self._stage.backend.wire.t_ns
         self._until_s = self._begun_t_ns * 1e-9 + OPERATION_S
