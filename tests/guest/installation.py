@@ -28,6 +28,7 @@ OF_THE_SYSTEM = (
 # Between packages and sources only the links count: what lies in an environment is pip's.
 ENVIRONMENT = "/venv/"
 EXPOSURE_LIMIT = 2.0
+RELOADS_S = 60.0
 VELOCITY_LIMIT, SLOWER_M_PER_S = "velocity_limit_m_per_s = 0.05", 0.04
 LIMITS = [["unlimited", "unlimited"], ["60", "60"]]
 
@@ -174,7 +175,7 @@ def _reload(profile: str, wanted: str) -> None:
     earlier = lines()
     PROFILE.write_text(profile)
     shell("systemctl", "reload", UNIT)
-    (line,) = until("the profile is read", lambda: lines()[len(earlier) :])
+    (line,) = until("the profile is read", lambda: lines()[len(earlier) :], RELOADS_S)
     check(f"reloaded, the log says: {wanted}", json.loads(line)["text"].startswith(wanted), line[:200])
 
 
