@@ -9,13 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from motions import SCAN
-from stage_pc import PORT, UNIT, check, report, rig, servo_pid, shell, stage, unit, until
+from stage_pc import PORT, POWERED, UNIT, check, report, rig, servo_pid, shell, stage, unit, until
 
 FAR_M, STRUCK_M = 0.1, 0.03
 HOMING_M_PER_S = 0.02  # stage-100hz.toml
 AT_REST_M_PER_S = 2e-4
 COASTS_M_PER_S = 5e-3  # cogging and cables pull at a macro without power
-_WITH_POWER = {"OPERATION_ENABLED", "QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE"}
 # Heartbeat time of the drives, the ramp from the speed limit, and how seldom it is looked at; a servo that lost its
 # supervisor waits for it first.
 DRIVES_STOP_S = 5.0
@@ -74,7 +73,7 @@ def stops(what: str, began_s: float, limit_s: float = DRIVES_STOP_S) -> None:
 
 def loses_power(what: str, restarts: int) -> None:
     """Wait until no drive has power; nobody but the servo that is left alone can have taken it."""
-    until(f"{what}: no power", lambda: not _WITH_POWER & set(rig.state()["drives"].values()), REST_PATIENCE_S)
+    until(f"{what}: no power", lambda: not POWERED & set(rig.state()["drives"].values()), REST_PATIENCE_S)
     check(f"{what}: the servo takes the power away", int(unit("NRestarts")) == restarts, rig.state()["drives"])
 
 

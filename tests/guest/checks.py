@@ -20,23 +20,24 @@ from breakage import (
     supervisor_killed,
     supervisor_out_of_memory,
 )
-from installation import confined, everything, installed, ready, removed, upgraded
+from installation import confined, everything, installed, ready, reloaded, removed, upgraded
 from motions import moved
 from opening import opened, real_time
 from stage_pc import HERE, UNIT, Failed, check, report, rig, shell
+from worlds import swapped
 
 CLOCK = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 Group = Callable[[], None]
 # For each machine of run.sh: what all else rests on, then what can be left out.
 GROUPS: dict[str, tuple[tuple[Group, ...], tuple[Group, ...]]] = {
-    "installation": ((installed, upgraded, opened), (confined, real_time)),
+    "installation": ((installed, upgraded, opened), (confined, real_time, reloaded)),
     "motion": (
         (ready, opened),
         (
             # First those that strike the drive's own homing, while its index is far off; then whatever has to be homed.
             supervisor_hung, servo_out_of_memory, supervisor_out_of_memory, supervisor_killed,
             moved,  # what systemd has started again is homed and armed
-            clock_stepped, serial_unplugged, servo_killed, can_down, recorded,  # the first two still homed
+            clock_stepped, serial_unplugged, servo_killed, swapped, can_down, recorded,  # the first two still homed
         ),
     ),
 }  # fmt: skip

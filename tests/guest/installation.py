@@ -1,12 +1,13 @@
 """Installed, upgraded, read back, removed."""
 
+import json
 import os
 import shutil
 import subprocess
 from pathlib import Path
 
 import stage_pc
-from stage_pc import PORT, UNIT, Failed, check, pids, rig, shell, stage, unit, until
+from stage_pc import PORT, UNIT, Failed, check, pids, rig, servo_pid, shell, stage, unit, until
 
 INSTALL = "/srv/stagectl/deploy/install.sh"
 INSTALL_BEFORE = "/srv/before/deploy/install.sh"
@@ -27,6 +28,8 @@ OF_THE_SYSTEM = (
 # Between packages and sources only the links count: what lies in an environment is pip's.
 ENVIRONMENT = "/venv/"
 EXPOSURE_LIMIT = 2.0
+RELOADS_S = 60.0
+VELOCITY_LIMIT, SLOWER_M_PER_S = "velocity_limit_m_per_s = 0.05", 0.04
 LIMITS = [["unlimited", "unlimited"], ["60", "60"]]
 
 
@@ -67,6 +70,8 @@ def ready() -> None:
     """The release is installed and given a profile, without further questions."""
     release = bring_release(before=False)
     rig.start(release)  # nothing is connected to it yet
+    # The machine that the service's own rig plays for this profile.
+    shutil.copy(stage_pc.HERE / "machine.toml", release / "sim_backend/machines" / PROFILE.name)
     shell(INSTALL, "install")
     configure()
 
@@ -117,26 +122,61 @@ def fails_to_start(release: str) -> None:
     shell("systemctl", "daemon-reload")
 
 
-def confined() -> None:
-    """Hardening and real time that the unit gives, read back from /proc and from systemd."""
-    pid = int(unit("MainPID"))
+def hardened(pid: int) -> None:
+    """What a process of the unit can't do, read back from /proc, and what systemd says of the unit."""
     facts = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
     capabilities = [facts[name].strip() for name in ("CapEff", "CapPrm", "CapInh", "CapAmb", "CapBnd")]
     check("it has no capability, and no way to one", set(capabilities) == {"0" * 16}, capabilities)
     secure = facts["NoNewPrivs"].strip(), facts["Seccomp"].strip()
     check("it gains no privileges, and its system calls are filtered", secure == ("1", "2"), secure)
     check("it is no root", facts["Uid"].split()[0] != "0", facts["Uid"].split())
+    exposure = shell("systemd-analyze", "security", "--no-pager", UNIT).strip().split("\n")[-1]
+    level = float(exposure.split(f"{UNIT}:")[1].split()[0])
+    check(f"exposure is at most {EXPOSURE_LIMIT}", level <= EXPOSURE_LIMIT, level)
+
+
+def confined() -> None:
+    """Hardening and real time that the unit gives, read back from /proc and from systemd."""
+    pid = int(unit("MainPID"))
+    hardened(pid)
     check("it has two CPUs, the servo's among them", os.sched_getaffinity(pid) == {0, 1}, os.sched_getaffinity(pid))
     limits = Path(f"/proc/{pid}/limits").read_text()
     granted = [line.split()[3:5] for line in limits.splitlines() if line.startswith(("Max realtime p", "Max locked"))]
     check("it may lock memory, and run at priority 60", granted == LIMITS, granted)
     check("the kernel is PREEMPT_RT", Path("/sys/kernel/realtime").read_text().strip() == "1", os.uname().release)
-    exposure = shell("systemd-analyze", "security", "--no-pager", UNIT).strip().split("\n")[-1]
-    level = float(exposure.split(f"{UNIT}:")[1].split()[0])
-    check(f"exposure is at most {EXPOSURE_LIMIT}", level <= EXPOSURE_LIMIT, level)
     tty = Path(os.path.realpath(PORT)).name
     latency = Path(f"/sys/bus/usb-serial/devices/{tty}/latency_timer").read_text().strip()
     check("the adapter has its name, and hands out within 1 ms", latency == "1", f"{tty}, {latency} ms")
+
+
+def reloaded() -> None:
+    """`systemctl reload`, hardened and without power: a wrong profile changes nothing, a right one is read."""
+    good = PROFILE.read_text()
+    slower = good.replace(VELOCITY_LIMIT, f"velocity_limit_m_per_s = {SLOWER_M_PER_S}", 1)
+    servo = servo_pid()
+    _reload(good.replace(VELOCITY_LIMIT, "velocity_limit_m_per_s = nan", 1), "kept as it was")
+    status = stage.status()
+    check("with a wrong profile the stage stays open", (status["state"], servo_pid()) == ("idle", servo))
+    _reload(slower, "read again")
+    until("another servo", lambda: servo_pid() != servo)
+    status = stage.await_state("idle", "fault")
+    check("the stage is opened with the new one", status["state"] == "idle", status["fault"])
+    limit_m_per_s = status["limits"]["velocity_m_per_s"]
+    check("its limit is the new one's", limit_m_per_s == SLOWER_M_PER_S, limit_m_per_s)
+
+
+def _reload(profile: str, wanted: str) -> None:
+    """Have the service read this; a check of what it says of that in the journal."""
+
+    def lines() -> list[str]:
+        said = shell("journalctl", "-u", UNIT, "--no-pager", "-o", "cat").splitlines()
+        return [line for line in said if line.startswith('{"event": "profile"')]
+
+    earlier = lines()
+    PROFILE.write_text(profile)
+    shell("systemctl", "reload", UNIT)
+    (line,) = until("the profile is read", lambda: lines()[len(earlier) :], RELOADS_S)
+    check(f"reloaded, the log says: {wanted}", json.loads(line)["text"].startswith(wanted), line[:200])
 
 
 def removed(before: set[str]) -> None:

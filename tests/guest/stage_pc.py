@@ -27,6 +27,7 @@ PATIENCE_S = 600.0  # a start of service and servo, emulated on a host that is b
 _LEASE_S = 20.0
 _ANSWER_S = 60.0
 _REST_S = 30.0
+POWERED = {"OPERATION_ENABLED", "QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE"}  # states of a drive
 # Compiled for every x86-64.
 GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 
@@ -130,6 +131,11 @@ class Stage:
         if answer.status >= 300:
             raise Failed(f"{method} {path}: {answer.status}: {content}")
         return json.loads(content) if content.startswith(("{", "[")) else content
+
+    @property
+    def token(self) -> str:
+        """The lease's that is held, empty without one: for a command that works under it."""
+        return self._token
 
     def status(self) -> dict[str, Any]:
         """Return where things stand."""
