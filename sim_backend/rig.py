@@ -364,8 +364,9 @@ class Rig:
                 parameters["right_m"] += offset_m
             return
         if fault.kind == "weak_motor":
-            name = "macro_force_constant_n_per_a" if fault.node_id == 1 else "micro_force_constant_n_per_a"
+            axis = "macro" if fault.node_id == self.machine.macro.node_id else "micro"
             ratio = fault.force_ratio if begins and fault.force_ratio is not None else 1.0
+            name = f"{axis}_force_constant_n_per_a"
             parameters[name] = ratio * plant.parameters(self.machine, 0)[name]
             return
         side = "travel_high_m" if offset_m > 0.0 else "travel_low_m"
