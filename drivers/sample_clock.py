@@ -265,7 +265,8 @@ def step(state: np.ndarray, sequence: int, arrival_t_ns: int) -> None:
             _start_window(state, w, sequence, arrival_t_ns)
         x = float(sequence - s.origin_sequence[w])
         if x * s.period_ns >= 2.0 * s.window_ns:
-            s.active = 1 - w
+            # Behind a gap this long early in a session the other does not run yet: then this one counts, begun anew.
+            s.active = 1 - w if s.size[1 - w] > 0 else w
             _start_window(state, w, sequence, arrival_t_ns)
             x = 0.0
         y = float(arrival_t_ns - s.origin_t_ns[w]) - x * s.period_ns - s.transport_ns

@@ -58,6 +58,16 @@ def choose(profile: Profile, backend: str) -> str:
     )
 
 
+def machine_of(profile: Profile, backend: str, machine: str | Path | None = None) -> str | Path | None:
+    """Return the machine that a simulated world plays, None where nothing is simulated.
+
+    The one named, else the profile's; ProfileError where it has none.
+    """
+    if backend == "hardware":
+        return None
+    return machine if machine is not None else machine_path_for(profile.name)
+
+
 def _folder_of(profile: Profile, runs_root: Path, name: str, kept_by_service: bool) -> Path:
     """Reserve a run's folder; the service may go on without, where the disk is full and the profile wants it so."""
     try:
@@ -86,12 +96,11 @@ def open_stage(
     Makes the run's folder: whoever leaves it empty gives it back (`run_folder.give_back`).
     """
     chosen = choose(profile, backend)
-    if chosen == "hardware":
-        progress(f"opening {chosen}", 0.0)
+    truth_of = machine_of(profile, chosen, machine)
+    progress(f"opening {chosen}", 0.0)
+    if truth_of is None:
         world = HardwareBackend(profile)
     else:
-        truth_of = machine if machine is not None else machine_path_for(profile.name)
-        progress(f"opening {chosen}", 0.0)
         world = (
             BatchBackend(load_machine(truth_of), seed=seed)
             if chosen == "batch"

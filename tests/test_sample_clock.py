@@ -107,6 +107,41 @@ def test_gaps_do_no_harm():
     assert rms((recovered_ns - true_ns[kept])[2000:]) < 150.0
 
 
+@pytest.mark.parametrize("before", [1, 2, 400, 12_000])
+@pytest.mark.parametrize("lost", [39_000, 41_000, 200_000])
+def test_a_gap_of_minutes_early_in_a_session_is_gone_over(before, lost):
+    """Two windows long, and the second window not running yet."""
+    true_ns, arrivals_t_ns = sensor(11, before + lost + 4000)
+    kept = np.r_[0:before, before + lost : true_ns.size]
+    state = sample_clock.init(PERIOD_NS, TRANSPORT_NS)
+    recovered_ns, deviation_ns = recover(state, kept, arrivals_t_ns[kept])
+    assert np.all(np.isfinite(recovered_ns))
+    assert np.all(np.isfinite(deviation_ns))
+    assert rms((recovered_ns - true_ns[kept])[-2000:]) < 200.0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_whatever_arrives_the_instant_is_a_number(seed):
+    """Gaps, restarts, bursts, silence and bundles of any length."""
+    rng = np.random.default_rng(seed)
+    for _ in range(50):
+        count = int(rng.integers(2, 600))
+        steps = np.ones(count, np.int64)
+        odd = rng.random(count) < rng.choice([0.0, 0.01, 0.3])
+        steps[odd] = (10.0 ** rng.uniform(0.0, rng.choice([3.0, 6.0, 9.0]), odd.sum())).astype(np.int64)
+        steps[rng.random(count) < rng.choice([0.0, 0.01])] *= -1
+        sequences = np.maximum(np.cumsum(steps), 0)
+        waits_ns = [rng.exponential(PERIOD_NS, count), steps * PERIOD_NS, 10.0 ** rng.uniform(0.0, 12.0, count)]
+        bundle_ns = rng.choice([1.0, 1e9])
+        arrivals_ns = np.floor(np.maximum.accumulate(np.cumsum(waits_ns[rng.integers(3)])) / bundle_ns) * bundle_ns
+        state = sample_clock.init(PERIOD_NS, TRANSPORT_NS, rng.choice([0.2, 20.0]), grid_ns=rng.choice([0.0, 1e6]))
+        recovered_ns, deviation_ns = recover(state, sequences, arrivals_ns.astype(np.int64) + BOOT_NS)
+        assert np.all(np.isfinite(recovered_ns))
+        assert np.all(deviation_ns > 0.0)
+        assert np.isfinite(state["slope_ns"][0])
+        assert np.isfinite(state["delay_ns"][0])
+
+
 def test_restart_of_the_sequence_starts_anew():
     true_ns, arrivals_t_ns = sensor(4, 8000)
     sequences = np.concatenate([np.arange(900_000, 904_000), np.arange(4000)])

@@ -157,6 +157,20 @@ def test_when_the_last_command_was_latched_is_told_from_its_own_sample():
     assert np.max(np.abs(np.array(told[2000:]) - meant[2000:])) < 0.2e-6
 
 
+@pytest.mark.parametrize("waiting", [2, 5, 300])
+def test_lines_that_waited_for_minutes_in_an_adapter_are_followed_by_todays(waiting):
+    """Such a jump ended the servo: the clock had been found from fewer lines than tell a jump from a gap."""
+    decoder, seen = WireDecoder(load_profile("oled-printer-umd2"), {}), fields(new(MEASUREMENT))
+    numbers = [*range(waiting), *range(60_000, 63_000)]
+    for cycle, number in enumerate(numbers):
+        sample_t_ns = 10**9 + cycle * MS
+        inbox = Inbox(t_ns=sample_t_ns + 400_000)
+        inbox.add_sensor_bytes(LINE % (COUNTS, number, 0, 0, -COUNTS // 2), sample_t_ns + 150_000)
+        assert decoder.decode(inbox, seen) == ""
+    assert (seen.samples_new, seen.sequence, seen.macro_position_m) == (1, 62_999, 0.0)
+    assert seen.sample_t_ns == pytest.approx(sample_t_ns, abs=1000)
+
+
 def test_a_line_that_comes_with_the_next_is_told_too():
     """Counts of the uMD2 move between them; alone, a sample has none before it."""
     decoder, seen = WireDecoder(load_profile("oled-printer-umd2"), {}), fields(new(MEASUREMENT))

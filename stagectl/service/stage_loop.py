@@ -19,7 +19,7 @@ from stagectl.service.states import Event, State
 from stagectl.service.view import BANNERS, backlash_message
 from stagectl.session import WATCHED_ONLY
 from stagectl.signals import Stop
-from stagectl.stage import choose
+from stagectl.stage import choose, machine_of
 from stagectl.supervisor import Supervisor
 from stagectl.wear import IDENTIFIED, PROBE
 
@@ -233,6 +233,7 @@ class StageLoop(StageWatch):
         try:
             profile = self._profile_as_read()
             chosen = choose(profile, order.body.backend)
+            machine_of(profile, chosen, self.settings.machine)
         except (ProfileError, LinkError) as error:  # the world that is open is as sound as before
             raise RequestError(str(error)) from error
         self._log.say("backend", BANNERS[chosen], backend=chosen, asked=order.body.backend, before=self._backend)

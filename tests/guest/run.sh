@@ -72,4 +72,5 @@ for machine in ${GUEST_MACHINES:-installation motion}; do
   running+=($!)
 done
 for machine in "${running[@]}"; do wait "$machine" || code=$?; done
+grep --with-filename FAILED "$FOLDER"/*/share/log || true # once more, where the end of a long output is all that is kept
 exit $code

@@ -508,6 +508,23 @@ def test_the_world_of_a_stage_that_stopped_is_not_changed_before_its_fault_is_ac
     end(bench)
 
 
+def test_a_world_that_the_rig_has_no_machine_for_is_refused_and_the_stage_waits_as_before(tmp_path):
+    profile = tmp_path / "of-our-own.toml"
+    profile.write_text(changed(SINGLE, {"name": "of-our-own"}))
+    bench = begun(tmp_path, profile, "hardware")
+    bench.take()
+    bench.loop.step()
+    before = bench.status
+    refused = bench.do("backend", messages.SwapBackend(backend="rig"))
+    assert (refused.state, refused.error.kind) == ("failed", "RequestError")
+    assert "machine 'of-our-own' is not in" in refused.text
+    bench.loop.step()
+    assert bench.status.waiting_for.endswith("ask for another backend")
+    assert (bench.status.state, bench.status.backend, bench.status.fault) == ("off", "hardware", None)
+    assert bench.status.waiting_for == before.waiting_for
+    end(bench)
+
+
 def test_a_world_that_auto_chose_and_a_client_asked_for_stays_after_a_restart(tmp_path, rig_here, mine, plugs):
     bench = connected(tmp_path, mine, "auto")
     assert bench.status.banner == RIG
