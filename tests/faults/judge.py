@@ -27,7 +27,9 @@ swings, as its motor is too weak to hold it, strikes its stops as long as that l
 gives the macro a speed, which over the bandwidth of the drive's loop is how far it may go on top.
 
 A motion that no fault stops, or none has stopped yet, is judged in `unstopped.py`; a stop that the operator asked for
-by the same bound with the law's ramp. Behind the acknowledgement nothing may move or get power until it is asked for.
+by the same bound with the law's ramp. Where a homing had let go of the macro before anything was noticed, it rolls:
+then it must have been at rest as it was let go of. Behind the acknowledgement nothing may move or get power until it
+is asked for.
 """
 
 import contextlib
@@ -172,15 +174,15 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             found.append((TRAVEL, f"nobody held its key: macro went {way_m * 1e3:.3f} mm, bound {silent_m * 1e3:.3f}"))
     for from_t_ns, until_t_ns in facts.unasked:
         found += [(STANDSTILL, text) for text in moved_at_rest(seen, from_t_ns, until_t_ns)]
-    if facts.fault_kind and not _had_power(seen, facts.fault_t_ns, noticed, end):
-        at = int(np.searchsorted(t_ns, facts.fault_t_ns))
+    counts_from, detection_s = facts.fault_t_ns, drawn.detection_s
+    if not np.isfinite(detection_s):
+        counts_from, detection_s = noticed or facts.fault_t_ns, CYCLE_S
+    at = int(np.searchsorted(t_ns, counts_from))
+    dark = MACRO in drawn.without_power
+    if facts.fault_kind and not _had_power(seen, facts.fault_t_ns if dark else counts_from, noticed, end):
         found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
+        found += _let_go(seen, int(np.searchsorted(t_ns, facts.fault_t_ns)), at)
     elif facts.fault_kind:
-        counts_from, detection_s = facts.fault_t_ns, drawn.detection_s
-        if not np.isfinite(detection_s):
-            counts_from, detection_s = noticed or facts.fault_t_ns, CYCLE_S
-        at = int(np.searchsorted(t_ns, counts_from))
-        dark = MACRO in drawn.without_power
         rest = _rest(seen, at, end, noticed)
         stands, rests = _stands(seen, rest, end), end if rest is None else rest
         shifted_m = (1.0 + OVERSHOOT) * drawn.encoder_m
@@ -333,6 +335,13 @@ def _had_power(seen: dict[str, Any], fault_t_ns: int, noticed_t_ns: int | None, 
     at = max(int(np.searchsorted(seen["t_ns"], fault_t_ns)) - 1, 0)
     until = end if noticed_t_ns is None else int(np.searchsorted(seen["t_ns"], noticed_t_ns))
     return bool(np.isin(seen["states"][at : until + 1, 0], _POWERED).any())
+
+
+def _let_go(seen: dict[str, Any], at: int, end: int) -> list[tuple[str, str]]:
+    """Return where the macro lost its power while it moved."""
+    powered, speed = np.isin(seen["states"][at:end, 0], _POWERED), np.abs(seen["macro_velocity_m_per_s"][at:end])
+    fastest = float(speed[1:][powered[:-1] & ~powered[1:]].max(initial=0.0))
+    return [] if fastest < REST_M_PER_S else [(STANDSTILL, f"macro was let go of at {fastest:.3f} m/s")]
 
 
 def _enabled_again(seen: dict[str, Any], at: int, end: int) -> list[str]:

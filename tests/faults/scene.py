@@ -280,10 +280,9 @@ class Scene:
     def fill_disk(self) -> None:
         """Leave no byte."""
         self._filler = self.folder / "disk" / "filler"
-        with self._filler.open("wb") as file, contextlib.suppress(OSError):
+        with self._filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):  # a buffer fails as it closes
             while True:
                 file.write(bytes(1 << 16))
-                file.flush()
 
     def _free_disk(self) -> None:
         if self._filler is not None:

@@ -199,6 +199,24 @@ def test_judges_see_an_axis_that_is_let_go_of_before_it_rests():
     assert bars_missed(facts, record) == {TRAVEL, STANDSTILL}
 
 
+@pytest.mark.parametrize(("speed_m_per_s", "missed"), [(0.0, set()), (3e-3, {STANDSTILL})])
+def test_a_macro_that_a_homing_had_let_go_of_rolls_and_was_at_rest_then(speed_m_per_s, missed):
+    """Between the drive's homing and the law's power it has none; counts that are stuck are noticed there."""
+    stuck = Drawn("counts stuck", detection_s=np.inf, lasts_s=0.6)
+    facts, record = rest_after(2.0, noticed_s=0.35)
+    facts.phase, facts.fault_kind = "homing", "REFERENCE_LOST"
+    rolls = np.arange(2000) >= 1300
+    facts.seen["states"][:] = ENABLED
+    facts.seen["states"][rolls] = 1
+    velocity = np.where(rolls, speed_m_per_s + 20e-6 * (np.arange(2000) - 1300), 0.0)
+    velocity[1290:1300] = speed_m_per_s
+    facts.seen |= {"macro_velocity_m_per_s": velocity, "macro_position_m": 0.2 + np.cumsum(velocity) * 1e-3}
+    record.columns["run_phase"] = np.select([np.arange(2000) >= 1350, rolls], [7, 0], 3)
+    assert bars_missed(facts, record, stuck) == missed
+    facts.seen["states"][1500:1510] = ENABLED
+    assert bars_missed(facts, record, stuck) == missed | {STANDSTILL}
+
+
 def test_judges_see_a_drive_that_creeps_on_before_it_stands():
     """What it does in the 0.2 s behind |v| < 1 mm/s is travel, and no more than a loop that settles."""
     facts, record = rest_after(2.0)

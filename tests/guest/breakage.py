@@ -24,6 +24,7 @@ SEARCH_S = 30.0
 STEP_S = 2.0
 RUNS = Path("/var/lib/stagectl/runs")
 LATE_CYCLES = 8
+KILLED_COUNT = 3  # a supervisor, and one out of memory, and one that hung
 REPEATED_COUNT = 4  # of the scan: it outlasts two steps of the clock
 
 
@@ -112,7 +113,13 @@ def recorded() -> None:
     check("every run is whole, or was recovered", len(runs) > 5 and not lost, lost or sorted(runs.values()))
     records = [json.loads((RUNS / name / "manifest.json").read_text())["record"] for name in runs]
     lost_count = [record["rows_lost_count"] for record in records if record["state"] == "recovered"]
-    check("no row of them is lost", lost_count and not any(lost_count), f"{len(lost_count)} recovered: {lost_count}")
+    check("no row of them is lost", not any(lost_count), f"{len(lost_count)} recovered: {lost_count}")
+
+
+def recovered() -> None:
+    """What supervisors that are gone had left was recovered."""
+    states = [run["state"] for run in stage.ask("GET", "/v1/runs")]
+    check("one run for each of them", states.count("recovered") >= KILLED_COUNT, states)
 
 
 def clock_stepped() -> None:
@@ -203,6 +210,15 @@ def _without_supervisor(what: str, number: signal.Signals) -> None:
         loses_power(what, before)
     await_restart(what, before)
     recovers(what)
+
+
+def homed() -> None:
+    """What systemd has started again is homed and armed."""
+    with stage.lease():
+        stage.do("home")
+        drives = rig.state()["drives"]
+        check("started again, it is homed and armed", set(drives.values()) == {"OPERATION_ENABLED"}, drives)
+    stage.await_state("idle")
 
 
 def servo_out_of_memory() -> None:
