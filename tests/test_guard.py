@@ -121,17 +121,19 @@ def test_a_sample_of_the_future_says_how_far_and_what_to_check(oled_profile):
     assert "newest sample 1000 is 3.500 ms ahead of its cycle, limit 1 ms; check interferometer.rate_hz" in said
 
 
-def test_lines_that_are_late_for_good_end_the_run(oled_profile):
-    """Each is younger than the limit of age. Three cycles are no matter: the estimator predicts over them."""
+@pytest.mark.parametrize("is_braking", [False, True])
+def test_lines_that_are_late_for_good_end_the_run(oled_profile, is_braking):
+    """Each is younger than the limit of age. A line of the cycle before is no matter: the estimator takes it."""
     one = Cycle(oled_profile)
     for k in range(300):
-        assert one.set(cycle=1003 + k, sequence=1000 + k).stop() is Stop.NONE
+        assert one.set(cycle=1001 + k, sequence=1000 + k).stop() is Stop.NONE
     for k in range(100):
-        assert one.set(cycle=1304 + k, sequence=1300 + k).stop() is Stop.NONE
-    assert one.set(cycle=1404, sequence=1401).stop() is Stop.NONE  # and the count begins anew
+        assert one.set(cycle=1302 + k, sequence=1300 + k).stop() is Stop.NONE
+    assert one.set(cycle=1402, sequence=1401).stop() is Stop.NONE  # and the count begins anew
     for k in range(100):
-        assert one.set(cycle=1405 + k, sequence=1401 + k).stop() is Stop.NONE
-    assert one.set(cycle=1505, sequence=1501).stop() is Stop.SENSOR_AGE
+        assert one.set(cycle=1403 + k, sequence=1401 + k).stop() is Stop.NONE
+    one.guard["braking"] = float(is_braking)
+    assert one.set(cycle=1503, sequence=1501).stop() is Stop.SENSOR_AGE
     said = stop_detail(
         Stop.SENSOR_AGE, one.measurement[0], one.setpoint[0], np.zeros(1, COMMAND)[0], one.guard[0], {}, "dsmc"
     )
