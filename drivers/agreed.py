@@ -22,7 +22,11 @@ _CHANGING = (
     cia402.MODES_OF_OPERATION,  # another one while it homes
     cia402.MODES_OF_OPERATION_DISPLAY,
 )
-_WHERE_IT_EXISTS = ((cia402.RPDO_COMMUNICATION, 5), (cia402.COMMUNICATION_CYCLE_PERIOD, 0))
+_WHERE_IT_EXISTS = (
+    (cia402.RPDO_COMMUNICATION, 5),
+    (cia402.COMMUNICATION_CYCLE_PERIOD, 0),
+    (cia402.TPDO_MAPPING + 1, 2),
+)
 _NMT_OPERATIONAL = 5
 
 Agreed = dict[tuple[int, int], int]

@@ -35,6 +35,7 @@ _MAPPING_TORQUE = (0x6040_00_10, 0x6071_00_10)
 _MAPPING_POSITION = (0x6040_00_10, 0x607A_00_20, 0x60B2_00_10)
 _MAPPING_ACTUAL = (0x6041_00_10, 0x6064_00_20, 0x6077_00_10)
 _MAPPING_INPUTS = (0x60FD_00_20,)
+_MAPPING_INPUTS_AND_MODE = (*_MAPPING_INPUTS, 0x6061_00_08)
 
 _NEEDED = (
     (cia402.DEVICE_TYPE, (0,)),
@@ -359,14 +360,7 @@ def _configure_drive(master: "Master", drive: DriveSettings, remark: Callable[[s
     tpdo, tpdo_id = _map_pdo(
         store, cia402.TPDO_COMMUNICATION, TPDO1_ID + node_id, _MAPPING_ACTUAL, TRANSMISSION_EVERY_SYNC
     )
-    inputs, inputs_id = _map_pdo(
-        store,
-        cia402.TPDO_COMMUNICATION + 1,
-        TPDO2_ID + node_id,
-        _MAPPING_INPUTS,
-        TRANSMISSION_ON_EVENT,
-        inhibit_100us=drive.inputs_inhibit_us // 100,
-    )
+    inputs, inputs_id = _map_events(store, drive, remark)
     emcy_id = master.read(node_id, cia402.COB_ID_EMCY, 0) & _ID_MASK
     return DriveMapping(node_id, rpdo, tpdo, inputs, rpdo_id, tpdo_id, inputs_id, emcy_id)
 
@@ -424,6 +418,25 @@ def _watch_the_servo(store: "_Store", drive: DriveSettings, remark: Callable[[st
             f"{lacking}: {until}, so max torque (0x6072) is {1e-3 * word * rated_n:.4g} N instead of "
             f"{1e-3 * drive.max_torque_word * rated_n:.4g} N ({physics})"
         )
+
+
+def _map_events(store: "_Store", drive: DriveSettings, remark: Callable[[str], None]) -> tuple[Codec, int]:
+    """Map what the drive tells when it changes: inputs and mode of operation, the inputs alone where it can't."""
+
+    def mapped(words: tuple[int, ...]) -> tuple[Codec, int]:
+        communication, can_id = cia402.TPDO_COMMUNICATION + 1, TPDO2_ID + drive.node_id
+        inhibit_100us = drive.inputs_inhibit_us // 100
+        return _map_pdo(store, communication, can_id, words, TRANSMISSION_ON_EVENT, inhibit_100us)
+
+    try:
+        return mapped(_MAPPING_INPUTS_AND_MODE)
+    except DriveError as refusal:
+        found = mapped(_MAPPING_INPUTS)
+        remark(
+            f"node {drive.node_id} can't tell its mode of operation (0x6061) behind its inputs (0x60FD): another "
+            f"master that changes it is noticed by what the drive does then, not before ({refusal})"
+        )
+        return found
 
 
 class _Store:

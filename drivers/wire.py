@@ -22,6 +22,7 @@ from drivers.reading import END_VALID, MACRO_VALID, REFERENCE_LOST, RESTARTED, R
 from drivers.scale import counts_per_wavelength_of, metres_per_count
 from drivers.umd2 import Umd2Framer
 from stagectl.errors import LinkError, RequestError
+from stagectl.signals import MODE_TOLD
 
 if TYPE_CHECKING:
     from stagectl.profile import Profile
@@ -272,12 +273,16 @@ class WireDecoder:
         seen.tpdos_new = fresh
 
     def _take_events(self, axis: str, inbox: Inbox, seen: Any) -> None:
-        """Decode what a drive sends only when something happened: inputs and emergencies."""
+        """Decode what a drive sends only when something happened: inputs, mode, emergencies."""
         mapping = self.mappings[axis]
         payload = getattr(inbox, f"{axis}_inputs_tpdo")
         if payload is not None:
-            source = f"inputs of {axis} (node {mapping.node_id})"
-            setattr(seen, f"{axis}_digital_inputs", _decoded(mapping.inputs_tpdo, payload, source)[0])
+            codec, source = mapping.inputs_tpdo, f"inputs of {axis} (node {mapping.node_id})"
+            values = dict(zip(codec.names, _decoded(codec, payload, source), strict=True))
+            setattr(seen, f"{axis}_digital_inputs", values["digital_inputs"])
+            if "mode_display" in values:  # not every drive can map it there, and older runs have none
+                setattr(seen, f"{axis}_mode_display", values["mode_display"])
+                seen.modes_told |= MODE_TOLD[axis]
         payload = getattr(inbox, f"{axis}_emcy")
         if payload is not None:
             code = cia402.decode_emergency(payload)[0]

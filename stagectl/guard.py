@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drivers.arming import MODES
 from stagectl.compiled import compiled
 from stagectl.signals import Record, Stop
 
@@ -35,6 +36,8 @@ GUARD = np.dtype(
         ("micro_thermal_n", "f8"),
         ("micro_thermal_share", "f8"),
         ("input_trip_mask", "f8"),
+        ("macro_mode", "f8"),  # 0x6061 that a drive shows whose law commands it
+        ("micro_mode", "f8"),
         ("velocity_share", "f8"),
         ("has_micro", "f8"),
         ("braking", "f8"),  # 1 in a guided stop: the macro is brought to rest by its drive, only the micro is trusted
@@ -77,6 +80,7 @@ _LEASE = int(Stop.LEASE)
 _COMMAND_NOT_FINITE = int(Stop.COMMAND_NOT_FINITE)
 _MEASUREMENT_NOT_FINITE = int(Stop.MEASUREMENT_NOT_FINITE)
 _DRIVE_FAULT = int(Stop.DRIVE_FAULT)
+_DRIVE_MODE = int(Stop.DRIVE_MODE)
 _DIGITAL_INPUT = int(Stop.DIGITAL_INPUT)
 _EMERGENCY = int(Stop.EMERGENCY)
 _LINK_SILENT = int(Stop.LINK_SILENT)
@@ -104,11 +108,13 @@ def init(profile: "Profile", *, has_drives: bool) -> np.ndarray:
     g["silent_cycles"] = max(3.0, trip.sensor_age_s / period_s)
     g["lost_commands"] = max(3.0, trip.sensor_age_s / period_s)
     g["input_trip_mask"] = NEGATIVE_LIMIT | POSITIVE_LIMIT | SAFE_TORQUE_OFF | PRESSURE_LOW
+    g["macro_mode"] = MODES[macro.mode]
     g["velocity_share"] = _VELOCITY_SHARE
     g["macro_thermal_n"] = macro.thermal_force_n
     g["macro_thermal_share"] = period_s / macro.thermal_time_constant_s
     if micro is not None:
         g["has_micro"] = 1.0
+        g["micro_mode"] = MODES["torque"]
         g["micro_force_limit_n"] = micro.force_limit_n
         g["stroke_low_m"] = micro.stroke_m[0] * _STROKE_SHARE
         g["stroke_high_m"] = micro.stroke_m[1] * _STROKE_SHARE
@@ -127,8 +133,13 @@ def _drives_stop(g: Record, m: Record) -> int:
     else:
         if (m.macro_digital_inputs | m.micro_digital_inputs) & trip != 0:
             return _DIGITAL_INPUT
+        # Before an emergency: what the drive answers to a target of another mode follows from it.
+        if m.modes_told & 1 and m.macro_mode_display != g.macro_mode:
+            return _DRIVE_MODE
         if m.emergency != 0:
             return _EMERGENCY
+    if m.modes_told & 2 and g.has_micro != 0.0 and m.micro_mode_display != g.micro_mode:
+        return _DRIVE_MODE
     g.commands_lost = g.commands_lost + 1.0 if m.command_lost != 0 else 0.0
     if not g.commands_lost <= g.lost_commands:
         return _COMMAND_LOST

@@ -21,8 +21,8 @@ from stagectl.requests import STATUS, TEXT_BYTES_COUNT, TICKING, Mode, Phase
 from stagectl.ring import RequestReader, RequestWriter, RingWriter
 from stagectl.row import FRAME_BYTES_COUNT, ROW, new_rows
 from stagectl.row_fill import fill_row, fill_status
-from stagectl.signals import COMMAND, SETPOINT, Stop
-from stagectl.stop_text import emergency_detail, stop_detail
+from stagectl.signals import COMMAND, MODE_TOLD, SETPOINT, Stop
+from stagectl.stop_text import emergency_detail, mode_detail, stop_detail
 from stagectl.tracker import LAW_NAMES, Tracker, belief_of
 
 _TRACKING, _TRACK = Phase.TRACKING, Mode.TRACK  # a look-up in an enum costs 0.1 us
@@ -52,6 +52,7 @@ _GUIDED_STOPS = (
     Stop.DIGITAL_INPUT,
     Stop.EMERGENCY,
     Stop.LINK_SILENT,
+    Stop.DRIVE_MODE,
 )
 """Stops after which sensor and law can be trusted with the micro until the macro is slow, where its drive can."""
 
@@ -164,6 +165,9 @@ class Servo:
         self._heartbeat_every = max(1, int(trip.heartbeat_s / _HEARTBEATS_PER_TIMEOUT * profile.cycle.rate_hz))
         self._stop_deceleration = profile.macro.stop_deceleration_m_per_s2
         self._node_ids = {axis: profile.axis(axis).node_id for axis in profile.axes}
+        guard = tracker.active.guard
+        law_modes = {axis: int(guard[f"{axis}_mode"][0]) for axis in profile.axes}
+        self._modes = {Mode.TRACK: law_modes, Mode.HOME_DRIVE: {"macro": cia402.MODE_HOMING}}  # of drives with power
         self.phase = Phase.IDLE
         self.stop = Stop.NONE
         self.text = ""
@@ -300,10 +304,17 @@ class Servo:
             return False
         seen = self._seen
         obeys = cia402.state_of(seen.micro_statusword) is cia402.State.OPERATION_ENABLED
+        obeys = obeys and not self._shows_other_mode("micro", Mode.TRACK)
         tripped = seen.micro_digital_inputs & (_INTERLOCKS | _LIMIT_SWITCHES)
         failed = seen.emergency >> 16 == self._node_ids["micro"]
         silent = self.tracker.active.guard["micro_silence"][0] > 0.0
         return obeys and not tripped and not failed and not (silent and stop is Stop.LINK_SILENT)
+
+    def _shows_other_mode(self, axis: str, mode: Mode) -> bool:
+        """Tell whether a drive has told another mode of operation (0x6061) than it works in where `mode` is asked."""
+        seen = self._seen
+        shown = getattr(seen, f"{axis}_mode_display")
+        return bool(seen.modes_told & MODE_TOLD[axis]) and shown != self._modes[mode][axis]
 
     def _brake(self, stop: Stop, guided: bool, t_ns: int) -> None:
         """Leave the law: the macro by its drive; the micro still guided where it can be."""
@@ -403,6 +414,8 @@ class Servo:
         inputs = seen.macro_digital_inputs | seen.micro_digital_inputs
         if inputs & (_INTERLOCKS if mode is Mode.HOME_DRIVE else _INTERLOCKS | _LIMIT_SWITCHES):
             return Stop.DIGITAL_INPUT, self._detail(Stop.DIGITAL_INPUT)
+        if any(self._shows_other_mode(axis, mode) for axis in self._modes[mode]):
+            return Stop.DRIVE_MODE, mode_detail(self.tracker.active.measurement[0], self._modes[mode], self._node_ids)
         if mode is Mode.TRACK and seen.reference_lost != 0:
             return Stop.REFERENCE_LOST, self.decoder.reference_text
         if mode is Mode.TRACK and self.decoder.encoder_text:

@@ -50,6 +50,9 @@ MEASUREMENT = np.dtype(
         ("micro_statusword", "i8"),
         ("macro_digital_inputs", "i8"),  # 0x60FD
         ("micro_digital_inputs", "i8"),
+        ("macro_mode_display", "i8"),  # 0x6061
+        ("micro_mode_display", "i8"),
+        ("modes_told", "i8"),  # `MODE_TOLD` of each drive that has told its mode of operation; 0 is a mode, too
         ("tpdos_new", "i8"),  # bit 0 macro, bit 1 micro: a TPDO of the last SYNC arrived
         ("emergency", "i8"),  # last EMCY: node id << 16 | error code; 0 = none
         ("command_lost", "i8"),  # 1 when the last cycle's command could not be put on the bus
@@ -59,6 +62,9 @@ MEASUREMENT = np.dtype(
     ]
 )
 """What the loop knows of the world at the start of a tick; measured, never estimated."""
+
+MODE_TOLD = {"macro": 1, "micro": 2}
+"""The bits of MEASUREMENT.modes_told."""
 
 COMMAND = np.dtype(
     [
@@ -106,6 +112,7 @@ class Stop(IntEnum):
     STARVED = 25
     HOMING_GIVEN_UP = 26
     ENCODER_LOST = 27
+    DRIVE_MODE = 28
 
 
 STOP_TEXT = {
@@ -137,6 +144,7 @@ STOP_TEXT = {
     Stop.STARVED: "the set-points did not come in time: the stage braked to rest and holds",
     Stop.HOMING_GIVEN_UP: "the macro's drive gave its homing up",
     Stop.ENCODER_LOST: "the encoder of the macro's drive lies",
+    Stop.DRIVE_MODE: "a drive works in another mode of operation than it is commanded in",
 }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from drivers import cia402
 from stagectl.guard import NEGATIVE_LIMIT, POSITIVE_LIMIT, PRESSURE_LOW, SAFE_TORQUE_OFF
-from stagectl.signals import Stop
+from stagectl.signals import MODE_TOLD, Stop
 
 _AWAY = {NEGATIVE_LIMIT: "positive", POSITIVE_LIMIT: "negative"}
 """The direction that leads off a switch; none where both are pressed."""
@@ -34,6 +34,8 @@ def stop_detail(stop: Stop, m: Any, now: Any, command: Any, g: Any, node_ids: di
     if stop is Stop.COMMAND_NOT_FINITE:
         asked = f"{command['macro_force_asked_n']:g} N of the macro, {command['micro_force_asked_n']:g} N of the micro"
         return f"{law} asked {asked}; look for nan in the belief and the setpoints of this run"
+    if stop is Stop.DRIVE_MODE:
+        return mode_detail(m, {axis: int(g[f"{axis}_mode"]) for axis in node_ids}, node_ids)
     if stop in (Stop.DRIVE_FAULT, Stop.LINK_SILENT, Stop.EMERGENCY, Stop.DIGITAL_INPUT):
         return _drives(stop, m, g, node_ids)
     return ""
@@ -165,6 +167,16 @@ _REMEDIES = {
     Stop.LINK_SILENT: "check the drive's power and the CAN cable",
     Stop.DRIVE_FAULT: "read the drive, then acknowledge",
 }
+
+
+def mode_detail(m: Any, wanted: dict[str, int], node_ids: dict[str, int]) -> str:
+    """Say which drive shows another mode of operation than the one `wanted` of its axis; empty where none does."""
+    said: list[str] = []
+    for axis, mode in wanted.items():
+        shown = int(m[f"{axis}_mode_display"])
+        if int(m["modes_told"]) & MODE_TOLD[axis] and shown != mode:
+            said.append(f"{axis} (node {node_ids[axis]}): mode of operation 0x6061 is {shown}, wanted {mode}")
+    return f"{'; '.join(said)}; see who else on the bus writes 0x6060, then acknowledge" if said else ""
 
 
 def emergency_detail(emergency: int) -> str:

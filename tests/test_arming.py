@@ -151,7 +151,7 @@ def test_torque_mode_gives_the_mapping_read_back(bench):
     assert macro.rpdo.names == ("controlword", "target_torque")
     assert macro.rpdo.encode(15, -123) == bytes.fromhex("0F 00 85 FF")
     assert macro.tpdo.names == ("statusword", "position", "torque")
-    assert macro.inputs_tpdo.names == ("digital_inputs",)
+    assert macro.inputs_tpdo.names == micro.inputs_tpdo.names == ("digital_inputs", "mode_display")
     assert pickle.loads(pickle.dumps(macro)) == macro
 
 
@@ -186,8 +186,9 @@ def test_what_the_drive_holds_afterwards(bench):
         (0x1801, 1): "81020040",
         (0x1801, 2): "FF",
         (0x1801, 3): "1400",  # 2 ms = 20 x 100 us
-        (0x1A01, 0): "01",
+        (0x1A01, 0): "02",
         (0x1A01, 1): "2000FD60",
+        (0x1A01, 2): "08006160",  # 0x60610008
         (0x6007, 0): "0300",  # quick stop
         (0x605A, 0): "0600",
         (0x6060, 0): "0A",
@@ -273,6 +274,33 @@ def test_an_entry_that_can_t_be_mapped_refuses(bench):
     bench.macro.refused[0x1A00, 3] = 0x06040041
     words = r"node 1: 0x1A00:03 mapped object 3: wrote .*0x60770010.*read 0; this drive can't.*cannot be mapped"
     with pytest.raises(DriveError, match=words):
+        configure(bench.master, [MACRO])
+
+
+@pytest.mark.parametrize(
+    ("lack", "words"),
+    [
+        (lambda drive: drive.refused.update({(0x1A01, 2): 0x06040041}), "cannot be mapped"),
+        (lambda drive: drive.stuck.update({(0x1A01, 2): 0}), "read 0"),
+    ],
+    ids=["refused", "not kept"],
+)
+def test_a_drive_that_can_t_tell_its_mode_tells_its_inputs(bench, lack, words):
+    lack(bench.macro)
+    said = []
+    macro, micro = configure(bench.master, [MACRO, MICRO], said.append)
+    assert macro.inputs_tpdo.names == ("digital_inputs",)
+    assert micro.inputs_tpdo.names == ("digital_inputs", "mode_display")
+    assert bench.macro.data_store[0x1A01][0] == b"\x01"
+    assert bench.macro.data_store[0x1801][1] == bytes.fromhex("81020040")  # valid
+    assert len(said) == 1
+    pattern = r"node 1 can't tell its mode of operation \(0x6061\) behind its inputs .* mapped object 2: .*" + words
+    assert re.match(pattern, said[0])
+
+
+def test_a_drive_that_can_t_tell_its_inputs_refuses(bench):
+    bench.macro.refused[0x1A01, 1] = 0x06040041
+    with pytest.raises(DriveError, match="0x1A01:01 mapped object 1"):
         configure(bench.master, [MACRO])
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stagectl import guard
-from stagectl.signals import COMMAND, MEASUREMENT, SETPOINT, STOP_TEXT, Stop
+from stagectl.signals import COMMAND, MEASUREMENT, MODE_TOLD, SETPOINT, STOP_TEXT, Stop
 from stagectl.stop_text import stop_detail
 from tests.stage import with_values
 
@@ -180,6 +180,29 @@ def test_inputs_that_trip(oled_profile, bit):
     for axis in ("macro", "micro"):
         stop = Cycle(oled_profile).set(**{f"{axis}_digital_inputs": 1 << bit}).stop()
         assert stop is (Stop.DIGITAL_INPUT if bit in (0, 1, 3, 16) else Stop.NONE)
+
+
+@pytest.mark.parametrize("axis", ["macro", "micro"])
+@pytest.mark.parametrize("mode", [-128, -1, 0, 1, 6, 8, 9, 10, 11, 127])
+def test_a_drive_that_told_another_mode_than_its_own_stops(oled_profile, axis, mode):
+    """CiA 402: 10 is cyclic torque, 8 cyclic position, 6 homing, 0 none, below 0 the manufacturer's."""
+    position = with_values(oled_profile, macro__mode="position")
+    for profile, wanted in ((oled_profile, 10), (position, 8 if axis == "macro" else 10)):
+        one = Cycle(profile).set(**{f"{axis}_mode_display": mode})
+        assert one.stop() is Stop.NONE  # nothing was told yet
+        other = "micro" if axis == "macro" else "macro"
+        one.set(**{f"{other}_mode_display": one.guard[f"{other}_mode"][0]})
+        assert one.set(modes_told=MODE_TOLD[other]).stop() is Stop.NONE  # the other's own word
+        assert one.set(modes_told=3).stop() is (Stop.NONE if mode == wanted else Stop.DRIVE_MODE)
+
+
+def test_another_mode_says_more_than_what_the_drive_answers_to_its_targets(cycle):
+    cycle.set(modes_told=1, macro_mode_display=8, emergency=1 << 16 | 0x8611)
+    assert cycle.stop() is Stop.DRIVE_MODE
+    detail = stop_detail(
+        Stop.DRIVE_MODE, cycle.measurement[0], None, None, cycle.guard[0], {"macro": 1, "micro": 2}, "dsmc"
+    )
+    assert detail.startswith("macro (node 1): mode of operation 0x6061 is 8, wanted 10; ")
 
 
 @pytest.mark.parametrize("axis", ["macro", "micro"])
@@ -392,12 +415,20 @@ def test_a_limit_that_is_nan_stops(oled_profile, name):
 
 def test_behind_the_value_seam_there_are_no_drives(oled_profile):
     one = Cycle(oled_profile, has_drives=False)
-    one.set(macro_statusword=0, micro_statusword=0, tpdos_new=0, emergency=5, macro_digital_inputs=-1, command_lost=1)
+    one.set(
+        macro_statusword=0,
+        micro_statusword=0,
+        tpdos_new=0,
+        emergency=5,
+        macro_digital_inputs=-1,
+        modes_told=3,
+        command_lost=1,
+    )
     assert all(one.next() is Stop.NONE for _ in range(100))
 
 
 def test_one_axis_has_no_micro_to_watch(single_profile):
-    one = Cycle(single_profile).set(micro_statusword=0, tpdos_new=1, micro_n=1e6, macro_position_m=0.1)
+    one = Cycle(single_profile).set(micro_statusword=0, modes_told=2, tpdos_new=1, micro_n=1e6, macro_position_m=0.1)
     one.set(end_position_m=0.1, setpoint_position_m=0.1)
     assert all(one.next() is Stop.NONE for _ in range(100))
     assert one.next(end_position_m=0.102, setpoint_position_m=0.102) is Stop.NONE  # no stroke
@@ -413,11 +444,13 @@ BRAKING = [  # what the drive that brakes the macro makes meaningless, and what 
     ({"emergency": 1}, Stop.EMERGENCY, False),
     ({"macro_digital_inputs": 1}, Stop.DIGITAL_INPUT, False),
     ({"macro_statusword": 0x07}, Stop.DRIVE_FAULT, False),
+    ({"modes_told": 1, "macro_mode_display": 8}, Stop.DRIVE_MODE, False),
     ({"end_position_m": 3e-4}, Stop.FOLLOWING_ERROR, False),
     ({"macro_position_m": 0.46, "end_position_m": 0.46}, Stop.TRAVEL, False),
     ({"setpoint_velocity_m_per_s": 0.6}, Stop.VELOCITY, False),
     ({"micro_digital_inputs": 1 << 3}, Stop.DIGITAL_INPUT, True),
     ({"micro_statusword": 0x07}, Stop.DRIVE_FAULT, True),
+    ({"modes_told": 2, "micro_mode_display": 0}, Stop.DRIVE_MODE, True),
     ({"end_position_m": 1e-3}, Stop.MICRO_STROKE, True),
     ({"reference_lost": 1}, Stop.REFERENCE_LOST, True),
     ({"sample_t_ns": 0}, Stop.SENSOR_AGE, True),
@@ -501,6 +534,7 @@ WAYS = {
     Stop.COMMAND_NOT_FINITE: lambda one: one.set(macro_n=math.nan).stop(),
     Stop.MEASUREMENT_NOT_FINITE: lambda one: one.set(end_position_m=math.nan).stop(),
     Stop.DRIVE_FAULT: lambda one: one.set(macro_statusword=0x08).stop(),
+    Stop.DRIVE_MODE: lambda one: one.set(modes_told=3, macro_mode_display=8, micro_mode_display=10).stop(),
     Stop.DIGITAL_INPUT: lambda one: one.set(macro_digital_inputs=1).stop(),
     Stop.EMERGENCY: lambda one: one.set(emergency=1).stop(),
     Stop.LINK_SILENT: after_many(tpdos_new=0),

@@ -193,7 +193,8 @@ def test_a_drive_that_goes_dark_as_it_lets_go_is_named(tmp_path, single_profile,
         assert not stage.status()["stop"]
 
 
-def test_a_drive_that_is_sent_off_its_index_is_stopped(tmp_path, single_profile, single_machine):
+@pytest.mark.parametrize("tells", [True, False], ids=["the drive tells", "its word is lost"])
+def test_a_drive_that_is_sent_off_its_index_is_stopped(tells, tmp_path, single_profile, single_machine):
     """Another master changes the mode of the drive that holds, and it makes for a target that nobody gave."""
     backend = BatchBackend(single_machine, seed=1)
     held_t_ns: list[int] = []
@@ -205,6 +206,8 @@ def test_a_drive_that_is_sent_off_its_index_is_stopped(tmp_path, single_profile,
         if not struck_t_ns and held_t_ns and backend.wire.t_ns - held_t_ns[0] > 100_000_000:
             struck_t_ns = backend.wire.t_ns
             step_m = single_profile.macro.encoder_step_m
+            if not tells:
+                backend.rig.inject(Fault("drop_frame", can_id=0x280 + MACRO, duration_s=1e3), struck_t_ns)
             for index, value in ((cia402.TARGET_POSITION, round(0.002 / step_m)), (cia402.MODES_OF_OPERATION, 8)):
                 fault = Fault("object_change", node_id=MACRO, index=index, subindex=0, value=value)
                 backend.rig.inject(fault, struck_t_ns)
@@ -212,12 +215,16 @@ def test_a_drive_that_is_sent_off_its_index_is_stopped(tmp_path, single_profile,
     with Supervisor(single_profile, backend, tmp_path / "run", observe=strike) as stage:
         outcome = stage.home()
         truth = backend.rig.truth.arrays()
-    assert outcome.stop is Stop.FOLLOWING_ERROR
-    assert "its mode say" in outcome.detail
+    if tells:
+        assert outcome.stop is Stop.DRIVE_MODE
+        assert outcome.detail.startswith(f"macro (node {MACRO}): mode of operation 0x6061 is 8, wanted 6; ")
+    else:
+        assert outcome.stop is Stop.FOLLOWING_ERROR
+        assert "its mode say" in outcome.detail
     away = truth["t_ns"] > struck_t_ns
     fastest_m_per_s = np.abs(truth["macro_velocity_m_per_s"][away]).max()
-    assert 0.01 < fastest_m_per_s < 0.12
-    assert np.ptp(truth["macro_position_m"][away]) < 1.5e-3  # of the 2 mm that it was sent
+    assert (0.0 if tells else 0.01) < fastest_m_per_s < (0.06 if tells else 0.12)
+    assert np.ptp(truth["macro_position_m"][away]) < (0.5e-3 if tells else 1.5e-3)  # of the 2 mm that it was sent
     assert not read_run(tmp_path / "run").rows["homing_id"].any()
 
 

@@ -186,6 +186,7 @@ def test_no_drive_gets_power_without_a_lease(armed, phase):
 def test_a_homing_ends_with_its_lease(armed):
     servo = armed.servo
     macro_state = cia402.state_of(servo._seen.macro_statusword)
+    servo._seen.macro_mode_display = cia402.MODE_HOMING  # as the supervisor has it before it asks for a homing
 
     def homing(left_ns, mode=Mode.HOME_DRIVE, silent=False):
         armed.in_phase(Phase.HOMING_DRIVE, mode)

@@ -71,6 +71,19 @@ def test_a_flipped_bit_in_a_sensor_byte_is_noticed(recorded, byte):
     assert found.first_difference.startswith(f"row {row},")
 
 
+def test_a_run_of_drives_that_told_their_inputs_alone_replays(recorded):
+    """Older runs have no 0x6061 in TPDO2, and no field for it in their rows."""
+    rows, mappings = recorded.rows.copy(), recorded.manifest["mappings"]
+    assert rows["modes_told"].any()
+    for name in ("modes_told", "macro_mode_display", "micro_mode_display"):
+        rows[name] = 0
+    counts = rows["macro_inputs_tpdo_count"]
+    counts[counts > 0] = 4
+    older = {axis: {**mapping, "inputs_tpdo": [0x60FD_0020]} for axis, mapping in mappings.items()}
+    run = dataclasses.replace(recorded, rows=rows, manifest={**recorded.manifest, "mappings": older})
+    assert replay_run(run).first_difference == ""
+
+
 def test_a_flipped_bit_in_a_drive_s_position_is_noticed(recorded):
     row = moving_row(recorded, "macro_tpdo_count")
     found = replay_run(changed(recorded, "macro_tpdo", row, 2, 0))

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from drivers.air import ciddor_index
+from drivers.arming import DriveMapping
+from drivers.pdo import Codec
 from drivers.wire import Inbox, WireDecoder
 from sim_backend.batch import BatchWire
 from sim_backend.machine import load_machine
@@ -187,3 +189,44 @@ def test_a_line_that_comes_with_the_next_is_told_too():
         apart_m = told[place][2]
         assert apart_m[0] == pytest.approx(100 * decoder.macro_m_per_count, rel=1e-9)
         assert abs(apart_m[1]) == pytest.approx(50 * decoder.end_m_per_count, rel=1e-9)
+
+
+@pytest.mark.parametrize("axis", ["macro", "micro"])
+def test_what_a_drive_tells_of_inputs_and_mode(axis):
+    """0x60FD and 0x6061 behind it: 09 00 01 00 is 0x10009, 0A is 10, FF is -1; 0 is a mode, too."""
+    actual, command = Codec.from_mapping((0x6041_0010, 0x6064_0020, 0x6077_0010)), Codec.from_mapping((0x6040_0010,))
+    events = Codec.from_mapping((0x60FD_0020, 0x6061_0008))
+    mappings = {
+        name: DriveMapping(node, command, actual, events, 0x200 + node, 0x180 + node, 0x280 + node, 0x080 + node)
+        for node, name in ((1, "macro"), (2, "micro"))
+    }
+    decoder, seen = WireDecoder(load_profile("oled-printer"), mappings), fields(new(MEASUREMENT))
+
+    def told(payload: str) -> tuple[int, int, int]:
+        inbox = Inbox()
+        inbox.take(f"{axis}_inputs_tpdo", bytes.fromhex(payload))
+        assert decoder.decode(inbox, seen) == ""
+        return getattr(seen, f"{axis}_digital_inputs"), getattr(seen, f"{axis}_mode_display"), seen.modes_told
+
+    bit = {"macro": 1, "micro": 2}[axis]
+    assert decoder.decode(Inbox(), seen) == ""
+    assert seen.modes_told == 0
+    assert told("09 00 01 00 0A") == (0x10009, 10, bit)
+    assert told("00 00 00 00 FF") == (0, -1, bit)
+    assert told("00 00 00 00 00") == (0, 0, bit)
+    assert decoder.decode(Inbox(), seen) == ""
+    assert seen.modes_told == bit  # until the drive tells anew
+    short = Inbox()
+    short.take(f"{axis}_inputs_tpdo", bytes(4))
+    assert f"inputs of {axis} (node {bit}): PDO of 4 bytes" in decoder.decode(short, seen)
+
+
+def test_inputs_alone_tell_no_mode():
+    """Of a drive that can't map it, and of a run that was recorded when none did."""
+    actual, command = Codec.from_mapping((0x6041_0010, 0x6064_0020, 0x6077_0010)), Codec.from_mapping((0x6040_0010,))
+    mapping = DriveMapping(1, command, actual, Codec.from_mapping((0x60FD_0020,)), 0x201, 0x181, 0x281, 0x081)
+    decoder, seen = WireDecoder(load_profile("single-axis"), {"macro": mapping}), fields(new(MEASUREMENT))
+    inbox = Inbox()
+    inbox.take("macro_inputs_tpdo", bytes.fromhex("01 00 00 00 0A"))  # some drives always send 8 bytes
+    assert decoder.decode(inbox, seen) == ""
+    assert (seen.macro_digital_inputs, seen.macro_mode_display, seen.modes_told) == (1, 0, 0)

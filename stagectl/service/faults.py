@@ -29,6 +29,7 @@ _REMEDY = {
     Stop.RECORD_LOST: "free space on the disk of the runs, then acknowledge",
     Stop.HOMING_GIVEN_UP: "check index, limit switches and macro.homing, acknowledge, then home",
     Stop.ENCODER_LOST: "check the encoder, its cable and the drive, acknowledge, then home",
+    Stop.DRIVE_MODE: "see who else on the bus writes to the drive, then acknowledge: the stage is opened anew",
     Stop.SAMPLE_AHEAD: "check interferometer.rate_hz and the host's clock, then acknowledge",
 }
 
@@ -41,8 +42,8 @@ _ERROR_REMEDY: dict[type[StagectlError], str] = {
     RecordError: "free space or mend the permissions of the runs' folder, then acknowledge",
 }
 
-NEEDS_NEW_SERVO = (Stop.LINK_LOST,)
-"""A servo that has given its bus or port up doesn't open it again."""
+NEEDS_NEW_SERVO = (Stop.LINK_LOST, Stop.DRIVE_MODE)
+"""A servo that has given its bus or port up doesn't open it again; a drive gets its mode back as it is configured."""
 
 
 def of_stop(stop: Stop, detail: str, state: State, at: str, number: int) -> Fault:
