@@ -198,15 +198,15 @@ _CHANGES = (
 def mapping_changed(rng: np.random.Generator, phase: str) -> Drawn:
     """Another master's tool configures a drive while it works.
 
-    Another mode shows where something is to move; at rest the drive holds, and a homing writes the mode itself.
+    Another mode is told by the drive itself; a homing writes the mode, too.
     """
     what, index, subindex, value = one_of(rng, _CHANGES)
     node_id = MACRO if index in (0x1A00, 0x6060) else one_of(rng, (MACRO, MICRO))
     if index in (0x1400, 0x1800):
         value |= node_id
     fault = Fault("object_change", node_id=node_id, index=index, subindex=subindex, value=value)
-    must = index != 0x6060 or phase not in ("at rest", "homing")
-    detection_s = SILENCE_S if must else NEVER_S
+    must = index != 0x6060 or phase != "homing"
+    detection_s = (AT_ONCE_S if index == 0x6060 else SILENCE_S) if must else NEVER_S
     return Drawn(f"node {node_id}: {what}", (fault,), must_stop=must, detection_s=detection_s)
 
 
