@@ -36,6 +36,7 @@ _SILENCE_CODES = (0x81, 0x82, 0x87)  # communication, protocol, SYNC: without po
 _POWERED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia402.State.FAULT_REACTION_ACTIVE)
 _NO_ERROR = b"\0\0"  # an EMCY that takes the one before back
 _DISAGREEMENTS_IN_A_ROW = 5  # a host that holds a SYNC up by a millisecond is no lost reference
+_NEVER_AGREED = (-1, math.nan, math.nan)
 _CLOCK_SAMPLES = 200  # before the sample clock can tell that a number came too early
 _REPEATS_PROBABILITY = 1e-20  # that noise makes so many equal samples in a row
 _LEAST_REPEATS = 12  # of a sensor that is five times quieter than it is stated: one false alarm in 150 years
@@ -135,7 +136,8 @@ class WireDecoder:
         self.reference_lost = 0
         self.reference_text = ""  # why it was lost, for people
         self.encoder_text = ""  # what shows that the drive's encoder lies, and not the laser; empty while nothing does
-        self._laser_step_m = self._compared_encoder_m = math.nan
+        self._laser_step_m = math.nan
+        self._agreed = _NEVER_AGREED  # sample at which laser and encoder agreed last, and what each said
         self._encoder_jumped = False
         self._position_mode = profile.macro.mode == "position"
         self.encoder_trusted = False  # only after a homing do laser and encoder share a zero
@@ -402,13 +404,16 @@ class WireDecoder:
             since_ns = seen.sample_t_ns - sync_t_ns
             laser_m = macro_m - (macro_m - self._compared_m) * (since_ns / self.period_ns)
             allowed_m = self._disagreement_m + abs(macro_m - self._compared_m)
-            step_m = macro_m - self._compared_m
             if abs(laser_m - seen.macro_encoder_m) <= allowed_m:
                 self._disagreements = 0
+                self._agreed = (self.sequence, macro_m, seen.macro_encoder_m)
             else:
                 if self._disagreements == 0:
-                    laser_bends_m = abs(step_m - self._laser_step_m)
-                    encoder_bends_m = abs(seen.macro_encoder_m - self._compared_encoder_m - self._laser_step_m)
+                    # Late lines may lie between, and the jump before the first that could be compared again.
+                    sequence, agreed_m, agreed_encoder_m = self._agreed
+                    way_m = (self.sequence - sequence) * self._laser_step_m
+                    laser_bends_m = abs(macro_m - agreed_m - way_m)
+                    encoder_bends_m = abs(seen.macro_encoder_m - agreed_encoder_m - way_m)
                     bends_more = encoder_bends_m > laser_bends_m + 0.5 * self._disagreement_m
                     self._encoder_jumped = bends_more and not self._position_mode
                 self._disagreements += 1
@@ -419,10 +424,9 @@ class WireDecoder:
                         self.encoder_text = f"macro laser and the drive's encoder, which jumped, {text}"
                     else:
                         self._lose_reference(f"macro laser and the drive's encoder {text}")
-            self._laser_step_m = step_m
+            self._laser_step_m = macro_m - self._compared_m
         self._compared_sequence = self.sequence
         self._compared_m = macro_m
-        self._compared_encoder_m = seen.macro_encoder_m
 
     def set_zeros(self, macro_zero_counts: float, end_zero_counts: float) -> tuple[float, float]:
         """Take new laser zeros (a homing); returns by how much all macro and end positions moved, in m."""
@@ -433,7 +437,7 @@ class WireDecoder:
         self.reference_lost = 0
         self.reference_text = self.encoder_text = ""
         self.encoder_trusted = True
-        self._laser_step_m = self._compared_encoder_m = math.nan
+        self._laser_step_m, self._agreed = math.nan, _NEVER_AGREED
         self._macro_moved = self._end_moved = (math.nan, math.nan)
         self._macro_moved_sequence = self._end_moved_sequence = math.inf
         self._compared_sequence = -2
@@ -458,6 +462,9 @@ class WireDecoder:
         "samples_lost",
         "_compared_sequence",
         "_compared_m",
+        "_laser_step_m",
+        "_agreed",
+        "_encoder_jumped",
         "_disagreements",
         "_macro_moved",
         "_end_moved",

@@ -1,5 +1,7 @@
 """The decoder: when its bytes are taken changes nothing; the index of air follows the device's own air in a ramp."""
 
+import struct
+
 import numpy as np
 import pytest
 
@@ -189,6 +191,37 @@ def test_a_line_that_comes_with_the_next_is_told_too():
         apart_m = told[place][2]
         assert apart_m[0] == pytest.approx(100 * decoder.macro_m_per_count, rel=1e-9)
         assert abs(apart_m[1]) == pytest.approx(50 * decoder.end_m_per_count, rel=1e-9)
+
+
+@pytest.mark.parametrize("late", [(), (60,), (58, 59, 60)])
+@pytest.mark.parametrize(("who", "jump_m"), [("encoder", 3e-3), ("encoder", -3e-3), ("laser", 1e-3), ("laser", -1e-3)])
+def test_who_jumped_is_told_behind_late_lines_too(who, jump_m, late):
+    """At 0.2 m/s, one of the two off from sample 60 on: it can't be compared while lines are late."""
+    actual, command = Codec.from_mapping((0x6041_0010, 0x6064_0020, 0x6077_0010)), Codec.from_mapping((0x6040_0010,))
+    mappings = {
+        "macro": DriveMapping(1, command, actual, Codec.from_mapping((0x60FD_0020,)), 0x201, 0x181, 0x281, 0x81)
+    }
+    profile = load_profile("oled-printer-umd2")
+    decoder, seen = WireDecoder(profile, mappings), fields(new(MEASUREMENT))
+    inbox, waiting = Inbox(), b""
+    for number in range(75):
+        way_m, off_m = 2e-4 * number, jump_m if number >= 60 else 0.0
+        counts = (way_m + (off_m if who == "laser" else 0.0)) / decoder.macro_m_per_count
+        inbox.clear()
+        inbox.t_ns = 10**9 + number * MS + 400_000
+        waiting += LINE % (round(counts), number, 0, 0, round(counts))
+        if number not in late:
+            inbox.add_sensor_bytes(waiting, inbox.t_ns - 250_000)
+            waiting = b""
+        # The drive sampled it at the last SYNC, 0.4 ms before this line's sample.
+        encoder_m = way_m - 0.4e-3 * 0.2 + (off_m if who == "encoder" else 0.0)
+        inbox.take("macro_tpdo", struct.pack("<Hih", 0x0237, round(encoder_m / profile.macro.encoder_step_m), 0))
+        assert decoder.decode(inbox, seen) == ""
+        inbox.sync_t_ns = 10**9 + number * MS + 600_000
+        if number == 2:
+            decoder.set_zeros(0.0, 0.0)
+    assert seen.reference_lost == (who == "laser"), decoder.reference_text
+    assert ("which jumped" in decoder.encoder_text) == (who == "encoder")
 
 
 @pytest.mark.parametrize("axis", ["macro", "micro"])
