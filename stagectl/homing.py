@@ -170,9 +170,10 @@ class Homing(StreamMotion):
                 self._believe_width(wider_m, met, edge_m)
             if tries_count == _TOUCH_TRIES:
                 break
+        width_m = joint.left_m + joint.right_m
         raise DriveError(
             f"homing: not both edges of the joint were touched in {sweeps_count} sweeps at {TOUCH_SHARE:.0%} of "
-            f"backlash.touch_force_n, the widest for a gap of {(joint.left_m + joint.right_m) * 1e3:.3g} mm{reason}, with "
+            f"backlash.touch_force_n, the widest for a gap of {width_m * 1e3:.3g} mm{reason}, with "
             f"{self._missed_cycles_count() - missed_count} missed cycles; check backlash.left_m and right_m, "
             "micro.stroke_m and the voice coil, and where cycles were missed the host"
         )

@@ -297,7 +297,7 @@ def test_a_joint_that_has_worn_is_homed_and_its_width_is_told(side, by_m, tmp_pa
     assert home.backlash is not None
     found, true_m = home.backlash, machine.backlash.left_m + machine.backlash.right_m
     assert found.width_m == pytest.approx(true_m, abs=4.0 * np.hypot(found.left_sd_m, found.right_sd_m))
-    assert np.hypot(found.left_sd_m, found.right_sd_m) < 0.5e-6
+    assert np.hypot(found.left_sd_m, found.right_sd_m) < 0.32e-6  # both edges were pressed in full
     assert believed["left_m"] + believed["right_m"] == found.width_m
     assert found.centre_m == pytest.approx(0.5 * (oled_profile.backlash.right_m - oled_profile.backlash.left_m))
     assert abs(status["setpoint_relative_position_m"]) < 0.5 * true_m
@@ -306,11 +306,12 @@ def test_a_joint_that_has_worn_is_homed_and_its_width_is_told(side, by_m, tmp_pa
 
 
 def test_a_worn_joint_is_homed_again_as_gently(tmp_path, oled_profile, oled_machine):
-    """A first sweep of the found width, its zero off by half of that, would press with 5 N."""
+    """Its micro had come to rest beside an edge: a sweep of the width that was found pressed it with 5.6 N."""
     backend = BatchBackend(worn(oled_machine, "left", 400e-6), seed=1)
     with Supervisor(oled_profile, backend, tmp_path / "run") as stage:
         first = stage.home()
         stage.disarm()
+        stage.pump(40.0)
         second = stage.home()
     assert first.finished
     assert second.finished
@@ -331,7 +332,7 @@ def test_a_joint_that_is_out_of_reach_is_an_error_that_says_how_far_was_looked(
     machine = worn(oled_machine, side, 1.2e-3)
     backend = BatchBackend(machine, seed=1)
     with Supervisor(oled_profile, backend, tmp_path / "run") as stage:
-        with pytest.raises(DriveError, match=r"the widest for a gap of 0\.(69|93)\d* mm \(.*micro\.stroke_m\)"):
+        with pytest.raises(DriveError, match=r"the widest for a gap of 0\.(686|929) mm \(.*micro\.stroke_m\)"):
             stage.home()
         assert not stage.status()["stop"]
         assert stage.status()["phase"] == Phase.TRACKING
