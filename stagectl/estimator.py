@@ -59,7 +59,9 @@ ESTIMATOR = np.dtype(
     ]
 )
 
-_BRIDGED_SAMPLES = 10.0  # prediction over 10 ms is still within a few nm of the motion
+BRIDGED_SAMPLES = 10.0
+"""Missing in a row: prediction over 10 ms is still within a few nm of the motion."""
+
 
 FREE_SUPPLY_V = 1e12  # a belief's current loop never runs out of voltage
 
@@ -100,7 +102,7 @@ def init(profile: "Profile") -> np.ndarray:
     e["lead_s"] = macro_lag_s if profile.micro is None else compose.command_lag_s(profile.effects, "micro_command")
     e["macro_lead_s"] = macro_lag_s - e["lead_s"]
     e["longest_substep_s"] = 300e-6
-    e["bridged_samples_max"] = _BRIDGED_SAMPLES
+    e["bridged_samples_max"] = BRIDGED_SAMPLES
     e["position_mode"] = float(profile.macro.mode == "position")
     noise_m = profile.interferometer.noise_m
     control = profile.control

@@ -56,7 +56,9 @@ GUARD = np.dtype(
     ]
 )
 
-_STROKE_SHARE = 0.95  # of the stroke: the hard stops are beyond
+STROKE_SHARE = 0.95
+"""Of the stroke, that the micro may use: the hard stops are beyond."""
+
 _LATE_CYCLES, _LATE_AGES = 1, 5.0  # later than that for so many times the sensor's greatest age is late for good
 _VELOCITY_SHARE = 0.2  # of a new difference in the guard's own velocity: 5 ms, 5 nm noise gives 2 um/s
 
@@ -116,8 +118,8 @@ def init(profile: "Profile", *, has_drives: bool) -> np.ndarray:
         g["has_micro"] = 1.0
         g["micro_mode"] = MODES["torque"]
         g["micro_force_limit_n"] = micro.force_limit_n
-        g["stroke_low_m"] = micro.stroke_m[0] * _STROKE_SHARE
-        g["stroke_high_m"] = micro.stroke_m[1] * _STROKE_SHARE
+        g["stroke_low_m"] = micro.stroke_m[0] * STROKE_SHARE
+        g["stroke_high_m"] = micro.stroke_m[1] * STROKE_SHARE
         g["micro_thermal_n"] = micro.thermal_force_n
         g["micro_thermal_share"] = period_s / micro.thermal_time_constant_s
     return g

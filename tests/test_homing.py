@@ -1,5 +1,7 @@
 """Homing sets the zeros of a stage that stands, held by its drive; a drive that lets go of it stays without power."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
@@ -255,7 +257,122 @@ def test_a_sweep_that_the_host_spoilt_is_swept_again(tmp_path):
     home, took_s = touched_by_a_late_host(tmp_path / "once", 6.0)
     assert home.finished
     machine = load_machine("oled-printer").backlash
+    assert home.backlash is not None
+    assert machine is not None
     assert home.backlash.width_m == pytest.approx(machine.left_m + machine.right_m, abs=4.0 * home.backlash.left_sd_m)
     assert took_s > 12.0
     with pytest.raises(DriveError, match=r"in 4 sweeps at .* with [1-9]\d+ missed cycles; .* the host"):
         touched_by_a_late_host(tmp_path / "always", 100.0)
+
+
+# ---- a joint that has worn wider than the profile says ----
+
+
+class Touched(NamedTuple):
+    """What a homing touched, by the rig's own log from where its zeros were taken."""
+
+    greatest_force_n: float
+    low_m: float  # macro minus end
+    high_m: float
+
+
+def worn(machine, side, by_m):
+    """Copy a machine whose joint is wider on one side."""
+    edge_m = getattr(machine.backlash, f"{side}_m") + by_m
+    return with_values(machine, **{f"backlash__{side}_m": edge_m})
+
+
+def touched(folder, backend, first_id=1) -> Touched:
+    """Look at what happened since a homing took its zeros: the search of the index before shakes the joint as well."""
+    rows, truth = read_run(folder).rows, backend.rig.truth.arrays()
+    later = truth["t_ns"] > rows["sample_t_ns"][np.flatnonzero(rows["homing_id"] >= first_id)[0]]
+    relative_m = (truth["macro_position_m"] - truth["end_position_m"])[later]
+    return Touched(np.abs(truth["contact_force_n"][later]).max(), relative_m.min(), relative_m.max())
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("by_m", [150e-6, 235e-6, 400e-6])
+def test_a_joint_that_has_worn_is_homed_and_its_width_is_told(side, by_m, tmp_path, oled_profile, oled_machine):
+    """A gap wider than believed by more than a sweep presses was out of reach on its other side, for ever."""
+    machine = worn(oled_machine, side, by_m)
+    backend = BatchBackend(machine, seed=1)
+    with Supervisor(oled_profile, backend, tmp_path / "run") as stage:
+        home = stage.home()
+        believed = stage.believed_backlash()
+        status = stage.status()
+    assert home.finished
+    assert home.backlash is not None
+    found, true_m = home.backlash, machine.backlash.left_m + machine.backlash.right_m
+    assert found.width_m == pytest.approx(true_m, abs=4.0 * np.hypot(found.left_sd_m, found.right_sd_m))
+    assert np.hypot(found.left_sd_m, found.right_sd_m) < 0.32e-6  # both edges were pressed in full
+    assert believed["left_m"] + believed["right_m"] == found.width_m
+    assert found.centre_m == pytest.approx(0.5 * (oled_profile.backlash.right_m - oled_profile.backlash.left_m))
+    assert abs(status["setpoint_relative_position_m"]) < 0.5 * true_m
+    assert touched(tmp_path / "run", backend).greatest_force_n < oled_profile.backlash.touch_force_n
+    assert any(event["event"] == "joint_wider" for event in read_run(tmp_path / "run").events)
+
+
+def test_a_worn_joint_is_homed_again_as_gently(tmp_path, oled_profile, oled_machine):
+    """Its micro had come to rest beside an edge: a sweep of the width that was found pressed it with 5.6 N."""
+    backend = BatchBackend(worn(oled_machine, "left", 400e-6), seed=1)
+    with Supervisor(oled_profile, backend, tmp_path / "run") as stage:
+        first = stage.home()
+        stage.disarm()
+        stage.pump(40.0)
+        second = stage.home()
+    assert first.finished
+    assert second.finished
+    assert first.backlash is not None
+    assert second.backlash is not None
+    tolerance_m = 4.0 * np.hypot(first.backlash.left_sd_m, second.backlash.left_sd_m)
+    assert second.backlash.width_m == pytest.approx(first.backlash.width_m, abs=tolerance_m)
+    assert touched(tmp_path / "run", backend, 2).greatest_force_n < oled_profile.backlash.touch_force_n
+    rows = read_run(tmp_path / "run").rows
+    first_count, second_count = (np.unique(rows["segment_number"][rows["homing_id"] == k]).size for k in (1, 2))
+    assert second_count < first_count  # from the first edge on it goes by the width that was found
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_joint_that_is_out_of_reach_is_an_error_that_says_how_far_was_looked(
+    side, tmp_path, oled_profile, oled_machine
+):
+    machine = worn(oled_machine, side, 1.2e-3)
+    backend = BatchBackend(machine, seed=1)
+    with Supervisor(oled_profile, backend, tmp_path / "run") as stage:
+        with pytest.raises(DriveError, match=r"the widest for a gap of 0\.(686|929) mm \(.*micro\.stroke_m\)"):
+            stage.home()
+        assert not stage.status()["stop"]
+        assert stage.status()["phase"] == Phase.TRACKING
+        believed = stage.believed_backlash()
+    assert (believed["left_m"], believed["right_m"]) == (oled_profile.backlash.left_m, oled_profile.backlash.right_m)
+    seen = touched(tmp_path / "run", backend)
+    assert seen.greatest_force_n < oled_profile.backlash.touch_force_n
+    low_m, high_m = machine.micro.stroke_m
+    assert low_m < -seen.high_m
+    assert -seen.low_m < high_m
+
+
+def test_a_stop_in_a_wider_sweep_leaves_what_was_believed(tmp_path, oled_profile, oled_machine):
+    backend = BatchBackend(worn(oled_machine, "left", 400e-6), seed=1)
+
+    def stop_when_wider(what, share):
+        if what == "touching both edges" and stage.believed_backlash()["left_m"] > 2.0 * oled_profile.backlash.left_m:
+            stage.ask_to_stop()
+
+    with Supervisor(oled_profile, backend, tmp_path / "run", stop_when_wider) as stage:
+        assert stage.home().stop is Stop.OPERATOR
+        believed = stage.believed_backlash()
+    assert (believed["left_m"], believed["right_m"]) == (oled_profile.backlash.left_m, oled_profile.backlash.right_m)
+
+
+def test_an_edge_that_answers_and_can_not_be_told_is_pressed_no_harder(tmp_path):
+    """The damped joint of kang-2023, 4.5 mm wider: five sweeps more pressed it with 11 N."""
+    profile, machine = load_profile("kang-2023"), worn(load_machine("kang-2023"), "right", 4.5e-3)
+    backend = BatchBackend(machine, seed=1)
+    assert profile.backlash is not None
+    with (
+        Supervisor(profile, backend, tmp_path / "run") as stage,
+        pytest.raises(DriveError, match=r"what answered there with .* N could not be identified"),
+    ):
+        stage.home()
+    assert touched(tmp_path / "run", backend).greatest_force_n < 1.25 * profile.backlash.touch_force_n
