@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from drivers import cia402
 from drivers.pdo import Codec
 from stagectl.errors import DriveError, ProfileError
+from stagectl.signals import MODES
 
 if TYPE_CHECKING:
     from drivers.canopen_master import Master  # the servo unpickles a DriveMapping and must not load canopen
@@ -66,7 +67,6 @@ _NEEDED_TO_HOME = (
     (cia402.HOMING_ACCELERATION, (0,)),
 )
 
-MODES = {"torque": cia402.MODE_CST, "position": cia402.MODE_CSP}
 _ENERGISED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia402.State.FAULT_REACTION_ACTIVE)
 _IDENTITY_NAMES = ("vendor id", "product code", "revision number", "serial number")  # 0x1018:01 .. :04
 _REST_M_PER_S = 1e-3  # slower than this is standstill

@@ -47,8 +47,6 @@ DIGITAL_INPUTS = 0x60FD
 SUPPORTED_DRIVE_MODES = 0x6502
 
 MODE_HOMING = 6
-MODE_CSP = 8  # cyclic synchronous position
-MODE_CST = 10  # cyclic synchronous torque
 
 ABORT_CONNECTION_QUICK_STOP = 3  # 0x6007: a lost connection is answered as the quick-stop command is
 

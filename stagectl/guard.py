@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.arming import MODES
 from stagectl.compiled import compiled
-from stagectl.signals import Record, Stop
+from stagectl.signals import MODES, Record, Stop
 
 if TYPE_CHECKING:
     from stagectl.profile import Profile

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from drivers import cia402
-from stagectl import touch_sweep
+from stagectl import edge_search, touch_sweep
 from stagectl.errors import DriveError, LinkError, RequestError
-from stagectl.estimator import BRIDGED_SAMPLES
 from stagectl.outcome import BacklashEstimate, Outcome
 from stagectl.requests import Mode, Phase
 from stagectl.session import WATCHED_ONLY
@@ -17,11 +16,6 @@ from stagectl.stream_motion import StreamMotion
 from stagectl.touch_sweep import IDENTIFY_HZ, IDENTIFY_SHARE, KNOWN_OF_JOINT, TOUCH_HZ, TOUCH_S, TOUCH_SHARE
 
 _INDEX_METHODS = (33, 34)  # on the index mark: searched in negative, in positive direction
-_SIDES = ("right", "left")
-_TOUCH_TRIES = 4  # sweeps that find one edge, or that the host spoilt
-_WIDER_TRIES = 6  # oled-printer's stroke ends before; each takes 7 s, 25 s where the joint is wide and damped
-_SURE_RATIO = 0.1  # standard deviation of an edge that a gap is believed wider by, to the press of a sweep
-_ANSWER_S = 0.1  # as long as the identification looks at least
 _STANDSTILL_WINDOW_S = 0.2
 _STANDSTILL_M = 20e-6  # in that time: 0.1 um in a cycle of 1 ms
 _STANDSTILL_TIMEOUT_S = 3.0
@@ -107,7 +101,7 @@ class Homing(StreamMotion):
         believed = self.believed_backlash()
         met_both = False
         try:
-            outcome = self._sweep_until_met(believed["left_m"] + believed["right_m"])
+            outcome = self._sweep_until_met()
             met_both = outcome.finished
             return outcome
         finally:
@@ -115,100 +109,59 @@ class Homing(StreamMotion):
                 for name, value in believed.items():  # published with the zeros of the next homing
                     self._belief[name] = value
 
-    def _sweep_until_met(self, width_m: float) -> Outcome:
-        """Sweep until both edges were pressed in one sweep; a first guess of the end's zero may be off by half the gap.
-
-        Without power the micro swings on its spring between the edges, so where it stood when the zero was taken
-        says little; the edge that was met says where the other one is. Where a sweep that was centred by it meets it
-        again and not the other one, the gap is wider than it is believed: the next one reaches a part of its press
-        further, and a last one is centred by both. Cycles that the host missed, more in a row than the identification
-        is carried over, begin its holds anew: with 12 ms in every 200 ms a sweep met both edges and learnt of none.
-        Such a sweep is swept again.
-        """
-        own = touch_sweep.joint_of(self.profile)
-        if width_m > own.left_m + own.right_m:
+    def _sweep_until_met(self) -> Outcome:
+        """Sweep until both edges were pressed in one sweep, by what `stagectl.edge_search` makes of each before."""
+        joint, own = self._joint(), touch_sweep.joint_of(self.profile)
+        search = edge_search.init(self.profile, joint)
+        if joint.left_m + joint.right_m > own.left_m + own.right_m:
             # A sweep of a worn gap's width whose zero is off by half of it would press one edge with more than it may.
-            self._believe_width(own.left_m + own.right_m)
-        known, sweeps_count, tries_count, wider_count = None, 0, 0, 0
-        missed_count, found, reason = self._missed_cycles_count(), None, ""
+            self._believe(edge_search.Gap(own.left_m + own.right_m))
+        found, sweeps_count, missed_count = None, 0, self._missed_cycles_count()
         while True:
-            joint = touch_sweep.joint_of(self.profile, self.believed_backlash())
+            joint = self._joint()
             outcome = self.sweep(TOUCH_SHARE, TOUCH_HZ, TOUCH_S, "touching both edges")
             sweeps_count += 1
             estimate = outcome.backlash
             if not outcome.finished or estimate is None:
                 return outcome
-            if estimate.identifiable and (found is not None or wider_count == 0):
-                return outcome
             if found is not None:
-                return found
+                return outcome if estimate.identifiable else found
             if estimate.identifiable:
+                if search.wider_count == 0:
+                    return outcome
                 # An edge that a wider sweep has just reached was pressed less than it may be: 1.5 um off with 0.9 N.
                 found = replace(outcome, backlash=self.take_backlash(estimate))
                 continue
-            met = next((side for side in _SIDES if math.isfinite(getattr(estimate, f"{side}_sd_m"))), None)
-            is_sure = met is None or getattr(estimate, f"{met}_sd_m") < _SURE_RATIO * joint.press_m(TOUCH_SHARE)
-            edge_m = 0.0 if met is None else getattr(estimate, f"{met}_m")
-            if met is not None and (met != known or not is_sure):
-                self._believe_width(max(width_m, joint.left_m + joint.right_m), met, edge_m)
-                known = met if is_sure else None
-                tries_count += 1
-            elif self._was_held_up(outcome.rows):
-                tries_count += 1
-            else:
-                known = met
-                pressed_n = max(force_n for side, force_n in self._pressed_n(outcome.rows).items() if side != met)
-                try:
-                    wider_m = touch_sweep.wider_m(self.profile, joint, TOUCH_SHARE, met, pressed_n)
-                except RequestError as error:
-                    reason = f" ({error})"
-                    break
-                if wider_count == _WIDER_TRIES:
-                    break
-                wider_count += 1
-                self._event("joint_wider", met=met, pressed_n=pressed_n, width_m=wider_m)
-                self._believe_width(wider_m, met, edge_m)
-            if tries_count == _TOUCH_TRIES:
-                break
-        width_m = joint.left_m + joint.right_m
-        raise DriveError(
-            f"homing: not both edges of the joint were touched in {sweeps_count} sweeps at {TOUCH_SHARE:.0%} of "
-            f"backlash.touch_force_n, the widest for a gap of {width_m * 1e3:.3g} mm{reason}, with "
-            f"{self._missed_cycles_count() - missed_count} missed cycles; check backlash.left_m and right_m, "
-            "micro.stroke_m and the voice coil, and where cycles were missed the host"
-        )
+            try:
+                # The link keeps the newest 16 s: of a longer sweep, two swings and more.
+                gap = edge_search.step(search, joint, estimate, self.link.rows.read_last(outcome.rows))
+            except RequestError as error:
+                raise DriveError(
+                    f"homing: not both edges of the joint were touched in {sweeps_count} sweeps at {TOUCH_SHARE:.0%} "
+                    f"of backlash.touch_force_n, the widest for a gap of {(joint.left_m + joint.right_m) * 1e3:.3g} mm "
+                    f"({error}), with {self._missed_cycles_count() - missed_count} missed cycles; check "
+                    "backlash.left_m and right_m, micro.stroke_m and the voice coil, and where cycles were missed the "
+                    "host"
+                ) from error
+            if gap is None:
+                continue
+            if gap.width_m > joint.left_m + joint.right_m:
+                self._event("joint_wider", met=gap.known, pressed_n=search.pressed_n, width_m=gap.width_m)
+            self._believe(gap)
 
-    def _believe_width(self, width_m: float, known: str | None = None, edge_m: float = 0.0) -> None:
-        """Believe a gap as wide as that: from its `known` edge on, 'left' or 'right', or about the same middle."""
+    def _joint(self) -> touch_sweep.Joint:
+        return touch_sweep.joint_of(self.profile, self.believed_backlash())
+
+    def _believe(self, gap: edge_search.Gap) -> None:
+        """Believe a gap that nobody has measured whole."""
         joint = self.believed_backlash()
+        known, edge_m = gap.known, gap.edge_m
         if known is None:
-            known, edge_m = "right", joint["right_m"] + 0.5 * (width_m - joint["left_m"] - joint["right_m"])
-        joint["right_m"], joint["left_m"] = (
-            (edge_m, width_m - edge_m) if known == "right" else (width_m - edge_m, edge_m)
-        )
+            known, edge_m = "right", joint["right_m"] + 0.5 * (gap.width_m - joint["left_m"] - joint["right_m"])
+        other = "left" if known == "right" else "right"
+        joint |= {f"{known}_m": edge_m, f"{other}_m": gap.width_m - edge_m}
         sds = {name: math.inf for name in BacklashEstimate.__dataclass_fields__ if "_sd" in name}
         self.take_backlash(BacklashEstimate(**joint, **sds))
-
-    def _pressed_n(self, rows_count: int) -> dict[str, float]:
-        """Return with how much the joint answered on each side in the newest rows, whether it was identified or not.
-
-        From what the compensation took for contact and what it was taught better by. The spring's middle is not where
-        the zeros have it, which is there all the time; the blow of a believed edge that is none is over in 50 ms.
-        """
-        rows = self.link.rows.read_last(rows_count)
-        force_n = rows["contact_force_estimate_n"] + rows["micro_disturbance_n"]
-        count = round(_ANSWER_S * self.profile.cycle.rate_hz)
-        answer_n = np.convolve(force_n, np.full(count, 1.0 / count), "valid") - np.median(force_n)
-        return {"left": -float(answer_n.min()), "right": float(answer_n.max())}
-
-    def _was_held_up(self, rows_count: int) -> bool:
-        """Tell whether samples were missing in the newest rows, more in a row than the identification is carried over.
-
-        The link keeps the newest 16 s: of a longer sweep, two swings and more.
-        """
-        rows = self.link.rows.read_last(rows_count)
-        sampled_cycles = rows["cycle"][rows["samples_new"] > 0]
-        return bool(np.any(np.diff(sampled_cycles) > BRIDGED_SAMPLES))
 
     def _missed_cycles_count(self) -> int:
         return int(self.status()["missed_cycles"])

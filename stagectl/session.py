@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers import cia402
 from drivers.agreed import Agreed, changed, read_agreed
-from drivers.arming import MODES, DriveMapping, DriveSettings, configure
+from drivers.arming import DriveMapping, DriveSettings, configure
 from drivers.canopen_master import Master
 from stagectl.backend import Backend, ServoLink
 from stagectl.drive_settings import drive_settings
@@ -27,7 +27,7 @@ from stagectl.profile import AxisName, Profile, Temperature
 from stagectl.record import Recorder
 from stagectl.replay import describe_mapping
 from stagectl.requests import RESTING, Mode, Phase
-from stagectl.signals import STOP_TEXT, Stop, stop_sentence
+from stagectl.signals import MODES, STOP_TEXT, Stop, stop_sentence
 from stagectl.temperatures import DriveTemperature, News, Temperatures, answer_s
 from stagectl.tracker import LAW_NAMES
 from stagectl.undisturbed import undisturbed

@@ -63,6 +63,9 @@ MEASUREMENT = np.dtype(
 )
 """What the loop knows of the world at the start of a tick; measured, never estimated."""
 
+MODES = {"torque": 10, "position": 8}
+"""Mode of operation (CiA 402: cyclic synchronous torque, cyclic synchronous position) of a profile's `mode`."""
+
 MODE_TOLD = {"macro": 1, "micro": 2}
 """The bits of MEASUREMENT.modes_told."""
 

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 from stagectl import trajectory as trajectories
 from stagectl.backlash import HOLD_RATIO, filter_time_s
 from stagectl.errors import RequestError
-from stagectl.guard import STROKE_SHARE
 from stagectl.profile import Profile
 
 TOUCH_HZ, TOUCH_S, TOUCH_SHARE = 0.7, 6.0, 0.6
@@ -22,14 +21,6 @@ TOUCH_HZ, TOUCH_S, TOUCH_SHARE = 0.7, 6.0, 0.6
 IDENTIFY_HZ, IDENTIFY_SHARE = 1.0, 0.8
 """Identification's sweep where the joint allows it."""
 
-WIDENING_RATIO = 2.0 / 3.0
-"""By which share of its press a sweep that did not meet an edge reaches further the next time.
-
-An edge that was pressed by up to a third of it may have let go before the identification could tell: it is pressed as
-deep as any other then, and no deeper.
-"""
-
-_LEAST_WIDENING_RATIO = 0.1
 _HOLD_MARGIN_RATIO = 2.25  # of what the filter remembers: the joint is met earlier or later than it is believed
 _LEAST_SWINGS = 5.0  # of a slowed sweep; the first and the last are ramps
 
@@ -117,40 +108,6 @@ def joint_of(profile: Profile, believed: Mapping[str, float] | None = None, foun
         hold_s=HOLD_RATIO * filter_time_s(profile),
         found=found,
     )
-
-
-def wider_m(profile: Profile, joint: Joint, force_share: float, met: str | None, pressed_n: float) -> float:
-    """Return how wide to believe the gap after a sweep that `met` one edge, 'left' or 'right', where it was believed.
-
-    None as `met`: it met neither, and reaches further on both sides the next time. `pressed_n` is what answered where
-    no edge was met: with the next sweep that edge is pressed as deep as any. Errors: RequestError where the edge is
-    pressed that deep by now, and where the wider sweep would leave the micro's stroke.
-
-    Where in the stroke the edge stands that was met is known from the profile, for an edge that has worn has moved
-    outwards; nobody knows where a sweep lies that met none, except that it was as far away as it swings.
-    """
-    backlash, micro = profile.backlash, profile.micro
-    if backlash is None or micro is None:
-        raise RequestError(f"profile {profile.name}: this stage has no micro; there is no backlash to identify")
-    press_m = joint.press_m(force_share)
-    left_m = press_m * (1.0 - pressed_n / (force_share * joint.touch_force_n))
-    if left_m < _LEAST_WIDENING_RATIO * press_m:
-        raise RequestError(f"what answered there with {pressed_n:.1f} N could not be identified")
-    width_m = joint.left_m + joint.right_m + (1.0 if met else 2.0) * min(left_m, WIDENING_RATIO * press_m)
-    amplitude_m = 0.5 * width_m + press_m
-    # End minus macro is -x_b. These are the zeros that hold, by which the guard judges: the middle is the profile's.
-    middle_m = 0.5 * (backlash.left_m - backlash.right_m)
-    reached_m = [middle_m - amplitude_m, middle_m + amplitude_m]
-    if met == "right":
-        reached_m.append(-backlash.right_m + width_m + press_m)
-    elif met == "left":
-        reached_m.append(backlash.left_m - width_m - press_m)
-    else:
-        reached_m += [middle_m - 2.0 * amplitude_m, middle_m + 2.0 * amplitude_m]
-    low_m, high_m = (STROKE_SHARE * end_m for end_m in micro.stroke_m)
-    if not (low_m <= min(reached_m) and max(reached_m) <= high_m):
-        raise RequestError("a wider one might leave micro.stroke_m")
-    return width_m
 
 
 def contact_damping_n_s_per_m(effects: Iterable[Mapping[str, Any]]) -> float:

@@ -5,6 +5,7 @@ import pytest
 from drivers import cia402
 from drivers.cia402 import Homing, State, controlword, state_of
 from stagectl.errors import LinkError, RequestError
+from stagectl.signals import MODES
 
 # CiA 402-2, statusword coding: x = any bit. Both fillings of the free bits of every pattern.
 STATUSWORDS = [
@@ -117,7 +118,7 @@ def test_homing_bits(statusword, homing):
 
 
 def test_modes_and_objects():
-    assert (cia402.MODE_HOMING, cia402.MODE_CSP, cia402.MODE_CST) == (6, 8, 10)
+    assert (cia402.MODE_HOMING, MODES["position"], MODES["torque"]) == (6, 8, 10)
     assert cia402.ENABLE_OPERATION | cia402.HOMING_START == 0x1F
     assert (cia402.CONTROLWORD, cia402.STATUSWORD, cia402.TARGET_TORQUE) == (0x6040, 0x6041, 0x6071)
 

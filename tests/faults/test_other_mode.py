@@ -9,7 +9,7 @@ from stagectl.errors import DriveError
 from stagectl.record import read_run
 from stagectl.replay import replay_run
 from stagectl.requests import TICKING, Phase
-from stagectl.signals import Stop
+from stagectl.signals import MODES, Stop
 from tests.struck_stage import Stage, inject
 
 MACRO, MICRO = 1, 2  # node ids
@@ -25,7 +25,7 @@ def written(node_id: int, index: int, value: int) -> Fault:
 def sent_to_a_stale_target(one: Stage, encoder_step_m: float) -> tuple[Fault, Fault]:
     """Let the macro's drive hold a target near by, and change its mode to one that goes there."""
     target = one.stage.master.read(MACRO, cia402.POSITION_ACTUAL_VALUE) + round(STALE_M / encoder_step_m)
-    return written(MACRO, cia402.TARGET_POSITION, target), written(MACRO, cia402.MODES_OF_OPERATION, cia402.MODE_CSP)
+    return written(MACRO, cia402.TARGET_POSITION, target), written(MACRO, cia402.MODES_OF_OPERATION, MODES["position"])
 
 
 def held_and_struck(one: Stage, *faults: Fault) -> tuple[int, dict[str, np.ndarray]]:
@@ -113,5 +113,5 @@ def test_a_row_holds_the_modes_that_the_drives_told(tmp_path, oled_profile, oled
     ticking = rows[np.isin(rows["run_phase"], [int(phase) for phase in TICKING])]
     assert len(ticking) > 100
     for axis in ("macro", "micro"):
-        assert set(ticking[f"{axis}_mode_display"]) == {cia402.MODE_CST}
+        assert set(ticking[f"{axis}_mode_display"]) == {MODES["torque"]}
     assert set(ticking["modes_told"]) == {3}
