@@ -132,6 +132,7 @@ class Homing(StreamMotion):
                 # An edge that a wider sweep has just reached was pressed less than it may be: 1.5 um off with 0.9 N.
                 found = replace(outcome, backlash=self.take_backlash(estimate))
                 continue
+            wider_count = search.wider_count
             try:
                 # The link keeps the newest 16 s: of a longer sweep, two swings and more.
                 gap = edge_search.step(search, joint, estimate, self.link.rows.read_last(outcome.rows))
@@ -145,7 +146,7 @@ class Homing(StreamMotion):
                 ) from error
             if gap is None:
                 continue
-            if gap.width_m > joint.left_m + joint.right_m:
+            if search.wider_count > wider_count:
                 self._event("joint_wider", met=gap.known, pressed_n=search.pressed_n, width_m=gap.width_m)
             self._believe(gap)
 

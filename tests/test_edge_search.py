@@ -1,9 +1,14 @@
 """The search for the joint's edges: how much further the next sweep reaches, and when it is not a wider one."""
 
+import math
+
+import numpy as np
 import pytest
 
 from stagectl import edge_search, touch_sweep
 from stagectl.errors import RequestError
+from stagectl.outcome import BacklashEstimate
+from stagectl.row import new_rows
 from stagectl.touch_sweep import TOUCH_SHARE
 
 
@@ -41,3 +46,61 @@ def test_a_wider_sweep_stays_within_the_stroke(met, most_m, oled_profile):
         assert len(widths_m) == 2
     else:
         assert most_m - press_m / 1.5 < widths_m[-1] + press_m < most_m + 6e-6
+
+
+# ---- what a sweep is followed by ----
+
+
+def met(side, edge_m, sd_m=0.5e-6):
+    """What an identification has that met one edge, or none."""
+    values = {name: 0.0 for name in BacklashEstimate.__dataclass_fields__}
+    values |= {name: math.inf for name in values if "_sd" in name}
+    if side:
+        values |= {f"{side}_m": edge_m, f"{side}_sd_m": sd_m}
+    return BacklashEstimate(**values)
+
+
+def swept(missing_count=0):
+    """The rows of a sweep in which nothing answered; samples are missing in a row from the 100th on."""
+    rows = new_rows(2000)
+    rows["cycle"], rows["samples_new"] = np.arange(2000), 1
+    rows["contact_force_estimate_n"] = rows["micro_disturbance_n"] = 0.0
+    rows["samples_new"][100 : 100 + missing_count] = 0
+    return rows
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_an_edge_that_is_met_anchors_the_gap_and_met_again_the_gap_is_wider(side, oled_profile):
+    joint = touch_sweep.joint_of(oled_profile)
+    search = edge_search.init(oled_profile, joint)
+    width_m = joint.left_m + joint.right_m
+    assert edge_search.step(search, joint, met(side, 90e-6), swept()) == (width_m, side, 90e-6)
+    gap = edge_search.step(search, joint, met(side, 91e-6), swept())
+    assert gap == (pytest.approx(width_m + joint.press_m(TOUCH_SHARE) / 1.5), side, 91e-6)
+    assert search.wider_count == 1
+
+
+def test_an_edge_that_is_not_sure_centres_the_next_sweep_and_makes_no_gap_wider(oled_profile):
+    joint = touch_sweep.joint_of(oled_profile)
+    search = edge_search.init(oled_profile, joint)
+    for _ in range(3):
+        gap = edge_search.step(search, joint, met("right", 90e-6, sd_m=19e-6), swept())
+        assert gap == (joint.left_m + joint.right_m, "right", 90e-6)
+    with pytest.raises(RequestError, match="4 of them met one edge at another place, or missed cycles"):
+        edge_search.step(search, joint, met("right", 90e-6, sd_m=19e-6), swept())
+    assert search.wider_count == 0
+
+
+def test_a_sweep_that_the_host_spoilt_is_swept_again_also_where_one_edge_is_known(oled_profile):
+    joint = touch_sweep.joint_of(oled_profile)
+    search = edge_search.init(oled_profile, joint)
+    assert edge_search.step(search, joint, met("left", 30e-6), swept()) is not None
+    assert edge_search.step(search, joint, met("left", 30e-6), swept(missing_count=10)) is None
+    assert search.wider_count == 0
+    assert edge_search.step(search, joint, met("left", 30e-6), swept(missing_count=9)).width_m > 250e-6
+
+
+def test_a_gap_is_looked_for_no_narrower_than_it_was_found_before(oled_profile):
+    own = touch_sweep.joint_of(oled_profile)
+    search = edge_search.init(oled_profile, own._replace(right_m=400e-6))
+    assert edge_search.step(search, own, met("left", 30e-6), swept()).width_m == own.left_m + 400e-6
