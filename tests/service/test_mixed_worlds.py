@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from sim_backend.machine import MACHINES_FOLDER
 from stagectl import stage as stages
 from stagectl.backend import RIG_DRIVES, RIG_SENSOR, BatchBackend, RigBackend
 from stagectl.errors import RequestError
@@ -22,6 +23,7 @@ from tests.service.test_stage_loop import Bench
 from tests.toml_text import changed
 
 MOVE_M = 0.01
+STANDS_AT_M = 0.0114233  # without power: 2 N sin(2 pi x / 32 mm + 1.1) + 0.4 N = 0, where a push brings it back
 TRIES_COUNT = 5
 
 
@@ -75,7 +77,10 @@ def played(tmp_path_factory):
     """A rig as if it were hardware, and the file of a profile that leads to it."""
     folder = tmp_path_factory.mktemp("hardware")
     (folder / "patient.toml").write_text(changed(PROFILES_FOLDER / "single-axis.toml", PATIENT))
-    rig = RigBackend(load_profile(folder / "patient.toml"), "single-axis", seed=3)
+    # From elsewhere it creeps there with 0.3 mm/s, which a homing by its interferometer notices.
+    stands = changed(MACHINES_FOLDER / "single-axis.toml", {"start.macro_position_m": STANDS_AT_M})
+    (folder / "stands.toml").write_text(stands)
+    rig = RigBackend(load_profile(folder / "patient.toml"), folder / "stands.toml", seed=3)
     try:
         real = {"can.interface": "hub", "can.channel": rig.channel, "interferometer.port": rig._port}
         real["macro.identity.vendor_id"] = rig.vendor_id
