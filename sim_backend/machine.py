@@ -255,7 +255,12 @@ def load_machine(name_or_path: str | Path) -> Machine:
 
 def machine_path_for(profile_name: str) -> Path:
     """Return the machine file that plays a profile; ProfileError where there is none."""
-    return toml_file.find(profile_name, [MACHINES_FOLDER], "machine")
+    if profile_name not in list_machines():
+        raise ProfileError(
+            f"profile {profile_name}: the rig has no machine of that name to play it; it has "
+            f"{', '.join(list_machines())}. Give the profile the name of the one that it describes, or use the hardware"
+        )
+    return MACHINES_FOLDER / f"{profile_name}.toml"
 
 
 def list_machines() -> list[str]:

@@ -303,8 +303,8 @@ class Servo:
         if not self._has_micro or self.phase is Phase.GUIDED_STOP or stop not in _GUIDED_STOPS:
             return False
         seen = self._seen
-        obeys = cia402.state_of(seen.micro_statusword) is cia402.State.OPERATION_ENABLED
-        obeys = obeys and not self._shows_other_mode("micro", Mode.TRACK)
+        is_enabled = cia402.state_of(seen.micro_statusword) is cia402.State.OPERATION_ENABLED
+        obeys = is_enabled and not self._shows_other_mode("micro", Mode.TRACK)
         tripped = seen.micro_digital_inputs & (_INTERLOCKS | _LIMIT_SWITCHES)
         failed = seen.emergency >> 16 == self._node_ids["micro"]
         silent = self.tracker.active.guard["micro_silence"][0] > 0.0

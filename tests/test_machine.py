@@ -233,5 +233,7 @@ def test_micro_taken_out_names_everything_that_needs_it(bench):
 
 
 def test_profile_without_a_machine_says_what_there_is():
-    with pytest.raises(ProfileError, match=r"machine 'oled-prnter' is not in .*; did you mean oled-printer\?"):
+    with pytest.raises(
+        ProfileError, match=r"profile oled-prnter: the rig has no machine .* it has .*oled-printer.*\. Give"
+    ):
         machine_path_for("oled-prnter")

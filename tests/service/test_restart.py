@@ -517,7 +517,7 @@ def test_a_world_that_the_rig_has_no_machine_for_is_refused_and_the_stage_waits_
     before = bench.status
     refused = bench.do("backend", messages.SwapBackend(backend="rig"))
     assert (refused.state, refused.error.kind) == ("failed", "RequestError")
-    assert "machine 'of-our-own' is not in" in refused.text
+    assert "profile of-our-own: the rig has no machine of that name to play it" in refused.text
     bench.loop.step()
     assert bench.status.waiting_for.endswith("ask for another backend")
     assert (bench.status.state, bench.status.backend, bench.status.fault) == ("off", "hardware", None)
