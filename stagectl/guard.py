@@ -139,7 +139,7 @@ def _drives_stop(g: Record, m: Record) -> int:
             return _DRIVE_MODE
         if m.emergency != 0:
             return _EMERGENCY
-    if m.modes_told & 2 and g.has_micro != 0.0 and m.micro_mode_display != g.micro_mode:
+    if m.modes_told & 2 and m.micro_mode_display != g.micro_mode:  # none tells where there is none
         return _DRIVE_MODE
     g.commands_lost = g.commands_lost + 1.0 if m.command_lost != 0 else 0.0
     if not g.commands_lost <= g.lost_commands:
