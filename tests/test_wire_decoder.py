@@ -193,16 +193,26 @@ def test_a_line_that_comes_with_the_next_is_told_too():
         assert abs(apart_m[1]) == pytest.approx(50 * decoder.end_m_per_count, rel=1e-9)
 
 
+def _macro_alone() -> dict[str, DriveMapping]:
+    actual, command = Codec.from_mapping((0x6041_0010, 0x6064_0020, 0x6077_0010)), Codec.from_mapping((0x6040_0010,))
+    return {"macro": DriveMapping(1, command, actual, Codec.from_mapping((0x60FD_0020,)), 0x201, 0x181, 0x281, 0x81)}
+
+
+def _heard(decoder: WireDecoder, seen, number: int, counts: tuple[int, int], encoder_count: int) -> None:
+    """Decode one cycle: a line of the interferometer, and what the drive's encoder says."""
+    inbox = Inbox(t_ns=10**9 + number * MS + 400_000)
+    inbox.sync_t_ns = 10**9 + number * MS - 400_000 if number else 0
+    inbox.add_sensor_bytes(LINE % (counts[0], number, 0, 0, counts[1]), inbox.t_ns - 250_000)
+    inbox.take("macro_tpdo", struct.pack("<Hih", 0x0237, encoder_count, 0))
+    assert decoder.decode(inbox, seen) == ""
+
+
 @pytest.mark.parametrize("late", [(), (60,), (58, 59, 60)])
 @pytest.mark.parametrize(("who", "jump_m"), [("encoder", 3e-3), ("encoder", -3e-3), ("laser", 1e-3), ("laser", -1e-3)])
 def test_who_jumped_is_told_behind_late_lines_too(who, jump_m, late):
     """At 0.2 m/s, one of the two off from sample 60 on: it can't be compared while lines are late."""
-    actual, command = Codec.from_mapping((0x6041_0010, 0x6064_0020, 0x6077_0010)), Codec.from_mapping((0x6040_0010,))
-    mappings = {
-        "macro": DriveMapping(1, command, actual, Codec.from_mapping((0x60FD_0020,)), 0x201, 0x181, 0x281, 0x81)
-    }
     profile = load_profile("oled-printer-umd2")
-    decoder, seen = WireDecoder(profile, mappings), fields(new(MEASUREMENT))
+    decoder, seen = WireDecoder(profile, _macro_alone()), fields(new(MEASUREMENT))
     inbox, waiting = Inbox(), b""
     for number in range(75):
         way_m, off_m = 2e-4 * number, jump_m if number >= 60 else 0.0
@@ -222,6 +232,46 @@ def test_who_jumped_is_told_behind_late_lines_too(who, jump_m, late):
             decoder.set_zeros(0.0, 0.0)
     assert seen.reference_lost == (who == "laser"), decoder.reference_text
     assert ("which jumped" in decoder.encoder_text) == (who == "encoder")
+
+
+@pytest.mark.parametrize("repeats", [(60,), (80,), (60, 80)])
+@pytest.mark.parametrize("jump_m", [2e-3, -2e-3])
+def test_an_encoder_that_jumps_while_a_sample_repeats_another_is_no_stuck_laser(jump_m, repeats):
+    """At rest, with 5 counts of noise: each axis says the same twice by chance, as the encoder goes or comes back."""
+    profile = load_profile("oled-printer-umd2")
+    decoder, seen = WireDecoder(profile, _macro_alone()), fields(new(MEASUREMENT))
+    jump_count = round(jump_m / profile.macro.encoder_step_m)
+    random, counts = np.random.default_rng(1), (0, 0)
+    for number in range(100):
+        if number not in repeats:
+            counts = tuple(counts[k] + int(random.integers(1, 5)) * (-1) ** (number // 2) for k in range(2))
+        _heard(decoder, seen, number, counts, jump_count if 60 <= number < 80 else 0)
+        if number == 2:
+            decoder.set_zeros(0.0, 0.0)
+    assert seen.reference_lost == 0, decoder.reference_text
+    assert "which jumped" in decoder.encoder_text
+
+
+@pytest.mark.parametrize("stuck", ["macro", "end", "both"])
+def test_counts_that_are_stuck_are_found_where_the_encoder_goes_on(stuck):
+    """At 0.2 m/s: within two samples of where the encoder is the limit away."""
+    profile = load_profile("oled-printer-umd2")
+    decoder, seen = WireDecoder(profile, _macro_alone()), fields(new(MEASUREMENT))
+    lost_at = None
+    for number in range(80):
+        way_m = [2e-4 * (min(number, 60) if stuck in (axis, "both") else number) for axis in ("macro", "end")]
+        counts = (round(way_m[0] / decoder.macro_m_per_count), round(way_m[1] / decoder.end_m_per_count))
+        encoder_m = 2e-4 * number - 0.4e-3 * 0.2
+        _heard(decoder, seen, number, counts, round(encoder_m / profile.macro.encoder_step_m))
+        if number == 2:
+            decoder.set_zeros(0.0, 0.0)
+        if seen.reference_lost and lost_at is None:
+            lost_at = number
+    least = profile.interferometer.encoder_disagreement_m / 2e-4
+    assert lost_at is not None
+    assert 60 + least < lost_at <= 60 + least + 2
+    assert "counts are stuck" in decoder.reference_text
+    assert decoder.encoder_text == ""
 
 
 @pytest.mark.parametrize("axis", ["macro", "micro"])
