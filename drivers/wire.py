@@ -139,6 +139,9 @@ class WireDecoder:
         self._laser_step_m = math.nan
         self._agreed = _NEVER_AGREED  # sample at which laser and encoder agreed last, and what each said
         self._encoder_jumped = False
+        self._encoder_m = self._encoder_step_m = math.nan
+        self._encoder_cycles = 0  # since it came last
+        self._encoder_jump_sequence = -1  # sample at which it left its own way last
         self._position_mode = profile.macro.mode == "position"
         self.encoder_trusted = False  # only after a homing do laser and encoder share a zero
         self.samples_lost = 0
@@ -336,6 +339,9 @@ class WireDecoder:
             self._take_frames(inbox, seen)
         except LinkError as error:
             text = str(error)
+        self._encoder_cycles += 1
+        if seen.tpdos_new & 1:
+            self._follow_encoder(seen.macro_encoder_m)
         seen.t_ns = inbox.t_ns
         seen.samples_new = valid
         seen.sequence = self.sequence
@@ -356,30 +362,37 @@ class WireDecoder:
                 seen.macro_earlier_m = (macro_counts - self.macro_zero_counts) * self.macro_m_per_count
                 seen.end_earlier_m = (end_counts - self.end_zero_counts) * self.end_m_per_count
             if valid and self.encoder_trusted and seen.tpdos_new & 1:
-                self._look_for_stuck_counts(seen.macro_position_m, seen.macro_encoder_m)
+                self._look_for_stuck_counts(seen.macro_encoder_m)
             if valid and self.sequence == self.cycle:  # behind a late line the drive's position is of a later SYNC
                 self._compare_with_encoder(seen, inbox.sync_t_ns)
         seen.cycle = self.cycle
         seen.reference_lost = self.reference_lost
         return text
 
-    def _look_for_stuck_counts(self, macro_m: float, encoder_m: float) -> None:
+    def _follow_encoder(self, encoder_m: float) -> None:
+        """Note where the encoder leaves its own way by more than any stage gains from cycle to cycle: it jumped."""
+        step_m = (encoder_m - self._encoder_m) / self._encoder_cycles
+        if abs(step_m - self._encoder_step_m) > 0.5 * self._disagreement_m:
+            self._encoder_jump_sequence = self.sequence
+        self._encoder_m, self._encoder_step_m, self._encoder_cycles = encoder_m, step_m, 0
+
+    def _look_for_stuck_counts(self, encoder_m: float) -> None:
         """Latch *reference lost* where an axis repeats its counts, to the last bit, more often than its noise can.
 
-        Or while the drive moves: with counts coarser than the noise nothing else tells. An encoder that jumps says
-        nothing of that: one that came back while a sample repeated another by chance ended a stop by the lasers, and
-        the drive ramped down from the speed of that jump, over 130 mm.
+        Or while the drive moves: with counts coarser than the noise nothing else tells. An encoder that jumped since
+        they changed says nothing of that: one that came back while a sample repeated another by chance ended a stop
+        by the lasers, and the drive ramped down from the speed of that jump, over 130 mm.
         """
         if self.macro_counts != self._macro_moved[0]:
             self._macro_moved, self._macro_moved_sequence = (self.macro_counts, encoder_m), self.sequence
         if self.end_counts != self._end_moved[0]:
             self._end_moved, self._end_moved_sequence = (self.end_counts, encoder_m), self.sequence
-        for axis, moved_m, repeats, limit in (
-            ("macro", self._macro_moved[1], self.sequence - self._macro_moved_sequence, self._macro_repeats_limit),
-            ("end", self._end_moved[1], self.sequence - self._end_moved_sequence, self._end_repeats_limit),
+        for axis, moved_m, since, limit in (
+            ("macro", self._macro_moved[1], self._macro_moved_sequence, self._macro_repeats_limit),
+            ("end", self._end_moved[1], self._end_moved_sequence, self._end_repeats_limit),
         ):
-            lies = self.encoder_text != "" or self._encoder_bends_more(macro_m, encoder_m)
-            if not lies and not abs(encoder_m - moved_m) <= self._disagreement_m:
+            repeats = self.sequence - since
+            if self._encoder_jump_sequence <= since and not abs(encoder_m - moved_m) <= self._disagreement_m:
                 away_um = abs(encoder_m - moved_m) * 1e6
                 self._lose_reference(
                     f"{axis} counts are stuck: the drive's encoder moved {away_um:.0f} um meanwhile, "
@@ -412,10 +425,16 @@ class WireDecoder:
                 self._agreed = (self.sequence, macro_m, seen.macro_encoder_m)
             else:
                 if self._disagreements == 0:
-                    bends_more = self._encoder_bends_more(macro_m, seen.macro_encoder_m)
+                    # Late lines may lie between, and the jump before the first that could be compared again.
+                    sequence, agreed_m, agreed_encoder_m = self._agreed
+                    way_m = (self.sequence - sequence) * self._laser_step_m
+                    laser_bends_m = abs(macro_m - agreed_m - way_m)
+                    encoder_bends_m = abs(seen.macro_encoder_m - agreed_encoder_m - way_m)
+                    bends_more = encoder_bends_m > laser_bends_m + 0.5 * self._disagreement_m
                     self._encoder_jumped = bends_more and not self._position_mode
                 self._disagreements += 1
-                if self._disagreements >= _DISAGREEMENTS_IN_A_ROW and not self.encoder_text:
+                told = self.encoder_text != "" or self.reference_lost != 0  # the first cause stays
+                if self._disagreements >= _DISAGREEMENTS_IN_A_ROW and not told:
                     away_um = abs(laser_m - seen.macro_encoder_m) * 1e6
                     text = f"differ by {away_um:.0f} um, limit {allowed_m * 1e6:.0f} um"
                     if self._encoder_jumped:
@@ -425,16 +444,6 @@ class WireDecoder:
             self._laser_step_m = macro_m - self._compared_m
         self._compared_sequence = self.sequence
         self._compared_m = macro_m
-
-    def _encoder_bends_more(self, macro_m: float, encoder_m: float) -> bool:
-        """Tell whether the encoder left the way on which both agreed last by more than the laser did.
-
-        Late lines may lie between, and the jump before the first that could be compared again.
-        """
-        sequence, agreed_m, agreed_encoder_m = self._agreed
-        way_m = (self.sequence - sequence) * self._laser_step_m
-        laser_bends_m, encoder_bends_m = abs(macro_m - agreed_m - way_m), abs(encoder_m - agreed_encoder_m - way_m)
-        return encoder_bends_m > laser_bends_m + 0.5 * self._disagreement_m
 
     def set_zeros(self, macro_zero_counts: float, end_zero_counts: float) -> tuple[float, float]:
         """Take new laser zeros (a homing); returns by how much all macro and end positions moved, in m."""
@@ -473,6 +482,10 @@ class WireDecoder:
         "_laser_step_m",
         "_agreed",
         "_encoder_jumped",
+        "_encoder_m",
+        "_encoder_step_m",
+        "_encoder_cycles",
+        "_encoder_jump_sequence",
         "_disagreements",
         "_macro_moved",
         "_end_moved",

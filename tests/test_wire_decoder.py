@@ -252,22 +252,23 @@ def test_an_encoder_that_jumps_while_a_sample_repeats_another_is_no_stuck_laser(
     assert "which jumped" in decoder.encoder_text
 
 
+@pytest.mark.parametrize("step_m", [2e-4, 3e-5])
 @pytest.mark.parametrize("stuck", ["macro", "end", "both"])
-def test_counts_that_are_stuck_are_found_where_the_encoder_goes_on(stuck):
-    """At 0.2 m/s: within two samples of where the encoder is the limit away."""
+def test_counts_that_are_stuck_are_found_where_the_encoder_goes_on(stuck, step_m):
+    """At 0.2 m/s and where a stage comes to rest: within two samples of where the encoder is the limit away."""
     profile = load_profile("oled-printer-umd2")
     decoder, seen = WireDecoder(profile, _macro_alone()), fields(new(MEASUREMENT))
     lost_at = None
     for number in range(80):
-        way_m = [2e-4 * (min(number, 60) if stuck in (axis, "both") else number) for axis in ("macro", "end")]
+        way_m = [step_m * (min(number, 60) if stuck in (axis, "both") else number) for axis in ("macro", "end")]
         counts = (round(way_m[0] / decoder.macro_m_per_count), round(way_m[1] / decoder.end_m_per_count))
-        encoder_m = 2e-4 * number - 0.4e-3 * 0.2
+        encoder_m = step_m * (number - 0.4)
         _heard(decoder, seen, number, counts, round(encoder_m / profile.macro.encoder_step_m))
         if number == 2:
             decoder.set_zeros(0.0, 0.0)
         if seen.reference_lost and lost_at is None:
             lost_at = number
-    least = profile.interferometer.encoder_disagreement_m / 2e-4
+    least = profile.interferometer.encoder_disagreement_m / step_m
     assert lost_at is not None
     assert 60 + least < lost_at <= 60 + least + 2
     assert "counts are stuck" in decoder.reference_text
