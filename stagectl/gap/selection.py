@@ -581,10 +581,14 @@ def _has_akin(chosen: Sequence[Group], group: Group) -> bool:
 
 
 def _is_smooth(group: Group) -> bool:
-    """Tell whether a law is a force without step and memory, away from the joint."""
+    """Tell whether a law of the library is a force without step and memory, away from the joint.
+
+    Of a user's own nobody knows that its shape is found to the end: one that left 0.9 % drew three more names.
+    """
     known = CATALOGUE.get(group.key[0])
     return (
         known is not None
+        and not known.origin
         and not known.has_step
         and not known.memory
         and not _shows_at_low_speed(group)
