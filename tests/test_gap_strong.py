@@ -125,6 +125,25 @@ def test_a_strong_effect_is_searched_until_nothing_is_left_and_does_not_raise_th
         assert channels[0].scale == pytest.approx(1.0, abs=0.04)
 
 
+def test_a_drag_is_named_beside_a_ripple_of_ten_thousand_times_its_squares():
+    """A ripple along a motion that is measured is exact: what a friction, or bristles, would leave it does not."""
+    recordings = [
+        balance.recording_of(_axis_under(lambda n, x, v: _rippled_n(n, x, v) - 2.5 * v * abs(v), seed), AXIS)
+        for seed in (1, 2, 3)
+    ]
+    noise = slow_noise(AXIS, recordings[0])
+    first = Competition(recordings, 3, nulls_count=20, noise=noise)
+    first.judge.calibrate()
+    chosen = first.judge.select(most=1)
+    assert [group.key for group in chosen] == [("current_ripple", "macro_actuator")]
+    search = Competition(recordings, 3, noise=noise, kept=[first.term(chosen[0])])
+    search.judge.threshold = first.judge.threshold
+    found = search.judge.select(search.judge.reshaped(search.kept))
+    assert {group.key for group in found} == {("current_ripple", "macro_actuator"), ("quadratic_drag", "macro_force")}
+    judge, (ripple, drag) = search.judge, sorted(found, key=lambda group: group.key)
+    assert judge.gain(found) - judge.gain([drag]) > 1e4 * (judge.gain(found) - judge.gain([ripple]))
+
+
 def test_the_pitch_of_a_force_that_is_no_sine_is_searched_as_well():
     """From a seed that is 0.4 % off, over 8 pitches: there the two harmonics of its best sine miss by a third."""
 

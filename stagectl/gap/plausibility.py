@@ -30,7 +30,9 @@ _EDGE_S = 0.3
 _BLOCK_S = 0.25  # for the error of a factor; what is left is correlated for less
 _ACCELERATING_M_PER_S2 = 0.02  # rms; 0.01 to 0.7 in the recordings looked at
 _LEAST_EXPLAINED_RATIO = 0.05  # 0.64 and more; 0.13 beside a hidden spring that does most of the work
-_FACTOR_LIMIT = 3.0  # of one recording: 0.7 to 1.05
+_TELLING_RATIO = 0.4  # of what forces explain, from which on their factor tells of units: 0.64 and more, whatever the
+# unit. 0.17 beside bristles that hold the end of 0.02 m/s^2 with three times its force: 0.06 of what they could make it
+_FACTOR_LIMITS = 1.0 / 30.0, 3.0  # of one recording: 0.7 to 1.05, 0.28 beside such bristles; units make it 1e-3 or less
 _FACTOR_OTHER = 1.4  # of a machine's whole accelerating mass: less is what a hidden effect can do (half the micro's
 # force that nobody said to push the macro back looks like 30 %)
 _FACTOR_SDS = 20.0  # of all recordings together, in what is stated of mass and force constant
@@ -276,8 +278,8 @@ def _check_one(believed: Believed, one: _Balance) -> None:
     """Refuse a recording whose motion is not what its forces make."""
     if not one.accelerating:
         return
-    certain = abs(one.factor - 1.0) > _FACTOR_SIGMAS * one.factor_sd
-    if certain and not 1.0 / _FACTOR_LIMIT < one.factor < _FACTOR_LIMIT:
+    certain = one.explained_ratio > _TELLING_RATIO and abs(one.factor - 1.0) > _FACTOR_SIGMAS * one.factor_sd
+    if certain and not _FACTOR_LIMITS[0] < one.factor < _FACTOR_LIMITS[1]:
         raise RequestError(
             f"{one.run}: the {one.axis} accelerates {one.factor:.3g} times as much as its forces can make it"
             f"{_unit_hint(one.factor)}; check units and columns of the import, and that {believed.name} is this "

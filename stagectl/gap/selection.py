@@ -24,6 +24,10 @@ REPEATING_RATIO = 0.002
 EXACT_RATIO = 0.0005
 """The same where with it no curve finds anything any more: a wrong name explains only a part of what laws leave."""
 
+SMOOTH_RATIO = 2e-5
+"""The same of what smooth laws have gained: forces of place, time, command and speed along a motion that is measured to
+nanometres. Beside a ripple of 7.1 million squares a lag of 239 was left out, and of all that only 900 were left."""
+
 CURVE_GAIN = 3.0
 """Of what the best of the library gains on noise, what a curve has to gain to be a rest that something has left."""
 
@@ -396,10 +400,19 @@ class Judge:
         ratio = REPEATING_RATIO if repeats else MATERIAL_RATIO
         least = ratio * (whole - self.gain([]) + self.modelled)
         gained = whole - self.gain(chosen)
-        if EXACT_RATIO / ratio * least < gained <= least and self._is_exact_with(chosen, group):
+        if gained <= least and gained > self._inexact(chosen, whole) and self._is_exact_with(chosen, group):
             least = 0.0
         enough = max(self._threshold_of(group), least, self.price() * group.complexity)
         return gained > enough and self._foretells(chosen, [group])
+
+    def _inexact(self, chosen: Sequence[Group], whole: float) -> float:
+        """Return what the laws that are chosen may be inexact by where no curve is left, of `whole` that is gained."""
+        now = self.gain(chosen)
+        smooth = sum(
+            now - self.gain([other for other in chosen if other is not group]) for group in chosen if _is_smooth(group)
+        )
+        total = whole - self.gain([]) + self.modelled
+        return EXACT_RATIO * max(total - smooth, 0.0) + SMOOTH_RATIO * smooth
 
     def _is_exact_with(self, chosen: Sequence[Group], group: Group) -> bool:
         """Tell whether no curve finds anything any more with a hypothesis.
@@ -564,6 +577,22 @@ def _has_akin(chosen: Sequence[Group], group: Group) -> bool:
     """Tell whether another friction acts where a friction does."""
     return _shows_at_low_speed(group) and any(
         _shows_at_low_speed(other) and other.key[1] == group.key[1] for other in chosen
+    )
+
+
+def _is_smooth(group: Group) -> bool:
+    """Tell whether a law of the library is a force without step and memory, away from the joint.
+
+    Of a user's own nobody knows that its shape is found to the end: one that left 0.9 % drew three more names.
+    """
+    known = CATALOGUE.get(group.key[0])
+    return (
+        known is not None
+        and not known.origin
+        and not known.has_step
+        and not known.memory
+        and not _shows_at_low_speed(group)
+        and group.key[1].endswith(("_force", "_actuator"))
     )
 
 
