@@ -36,6 +36,7 @@ _SILENCE_CODES = (0x81, 0x82, 0x87)  # communication, protocol, SYNC: without po
 _POWERED = (cia402.State.OPERATION_ENABLED, cia402.State.QUICK_STOP_ACTIVE, cia402.State.FAULT_REACTION_ACTIVE)
 _NO_ERROR = b"\0\0"  # an EMCY that takes the one before back
 _DISAGREEMENTS_IN_A_ROW = 5  # a host that holds a SYNC up by a millisecond is no lost reference
+_GAIN_MARGIN = 1.5  # of what the motor's full force adds to a cycle's way: 29 um at 1 kHz, 2.9 mm at 100 Hz
 _NEVER_AGREED = (-1, math.nan, math.nan)
 _CLOCK_SAMPLES = 200  # before the sample clock can tell that a number came too early
 _REPEATS_PROBABILITY = 1e-20  # that noise makes so many equal samples in a row
@@ -158,6 +159,8 @@ class WireDecoder:
         self._earliest_ns = _EARLIEST_SHARE * sensor.transport_s * 1e9
         self._jump_m = sensor.jump_limit_m
         self._disagreement_m = sensor.encoder_disagreement_m
+        motor_gains_m = profile.macro.force_limit_n / profile.macro.mass_kg / profile.cycle.rate_hz**2
+        self._gain_limit_m = max(0.5 * self._disagreement_m, _GAIN_MARGIN * motor_gains_m)
         self._incremental = sensor.incremental
         self._single = profile.micro is None
         self._axes: dict[str, tuple[Codec, int, int, int, float, float, str]] = {}
@@ -370,9 +373,9 @@ class WireDecoder:
         return text
 
     def _follow_encoder(self, encoder_m: float) -> None:
-        """Note where the encoder leaves its own way by more than any stage gains from cycle to cycle: it jumped."""
+        """Note where the encoder leaves its own way by more than the motor can in a cycle: it jumped."""
         step_m = (encoder_m - self._encoder_m) / self._encoder_cycles
-        if abs(step_m - self._encoder_step_m) > 0.5 * self._disagreement_m:
+        if abs(step_m - self._encoder_step_m) > self._gain_limit_m:
             self._encoder_jump_sequence = self.sequence
         self._encoder_m, self._encoder_step_m, self._encoder_cycles = encoder_m, step_m, 0
 

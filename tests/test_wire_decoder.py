@@ -252,6 +252,23 @@ def test_an_encoder_that_jumps_while_a_sample_repeats_another_is_no_stuck_laser(
     assert "which jumped" in decoder.encoder_text
 
 
+@pytest.mark.parametrize("stuck", ["macro", "end", "both"])
+def test_counts_that_are_stuck_are_found_under_full_force(stuck):
+    """28 um more in each cycle, from rest: no jump of the encoder, and the next sample finds it."""
+    profile = load_profile("oled-printer-umd2")
+    decoder, seen = WireDecoder(profile, _macro_alone()), fields(new(MEASUREMENT))
+    way_m = np.cumsum(28e-6 * np.maximum(np.arange(70) - 50, 0))
+    for number in range(62):
+        at_m = [way_m[min(number, 60)] if stuck in (axis, "both") else way_m[number] for axis in ("macro", "end")]
+        counts = (round(at_m[0] / decoder.macro_m_per_count), round(at_m[1] / decoder.end_m_per_count))
+        encoder_m = way_m[number] - 0.4 * (way_m[number] - way_m[max(number - 1, 0)])
+        _heard(decoder, seen, number, counts, round(encoder_m / profile.macro.encoder_step_m))
+        if number == 2:
+            decoder.set_zeros(0.0, 0.0)
+        assert (seen.reference_lost != 0) == (number == 61), decoder.reference_text
+    assert "counts are stuck" in decoder.reference_text
+
+
 @pytest.mark.parametrize("step_m", [2e-4, 3e-5])
 @pytest.mark.parametrize("stuck", ["macro", "end", "both"])
 def test_counts_that_are_stuck_are_found_where_the_encoder_goes_on(stuck, step_m):
