@@ -42,6 +42,8 @@ def figures(*, full: bool, say: Say, seed: int | None = None, part: str | None =
     if part is not None and part not in PARTS:
         raise SystemExit(f"bench service --part {part}: choose from {', '.join(PARTS)}")
     begin_s, took, broken, ended = time.monotonic(), [], [], 0
+    if part is None and (reason := ten_pages.lacking()):
+        say(f"pages will not be measured: {reason}")
     for name, measure in PARTS.items():
         if part in (None, name):
             say(name)

@@ -106,9 +106,8 @@ def chromium_path() -> str | None:
 
 def figures(*, full: bool, say: Callable[[str], None]) -> Iterator[Figure]:
     """Measure the rows of the page."""
-    lacking = _lacking()
-    if lacking:
-        yield absent(INCREASE, lacking)
+    if reason := lacking():
+        yield absent(INCREASE, reason)
         return
     count, window_s = (PAIRS_FULL, WINDOW_FULL_S) if full else (PAIRS, WINDOW_S)
     with tempfile.TemporaryDirectory(prefix="stagectl-bench-") as name, contextlib.closing(_Stage(Path(name))) as stage:
@@ -199,7 +198,8 @@ def _greatest_rare_sum(count: int) -> int:
     return found
 
 
-def _lacking() -> str:
+def lacking() -> str:
+    """Say what this host lacks for it; nothing where it can be measured."""
     if len(os.sched_getaffinity(0)) < 2:
         return "one processor only: a browser would take the servo's"
     if not os.access(_KERNEL_WORK, os.W_OK):
