@@ -12,24 +12,38 @@ import time
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 
 from bench.figure import Figure
+from bench.seeds import seeds_of, text_of
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does; before numpy is loaded
 
 NAMES = ("gap", "main_job", "paper", "service")
 
 
-def _arguments(argv: list[str] | None) -> argparse.Namespace:
+def _arguments(argv: list[str] | None) -> tuple[argparse.Namespace, ModuleType]:
+    """Return what is asked for, and the set of figures that it is asked of; exits with 2 where that has none such."""
     parser = argparse.ArgumentParser(prog="python -m bench", description="Measure the project's figures.")
     parser.add_argument("name", choices=NAMES, help="which set of figures")
     parser.add_argument("--json", action="store_true", help="print one JSON object a figure")
     parser.add_argument("--full", action="store_true", help="more seeds and longer runs")
     parser.add_argument("--out", type=Path, help="write what is printed to this file as well")
     parser.add_argument("--markdown", type=Path, help="write the table with date and host load to this file")
-    parser.add_argument("--seed", type=int, help="service: play one run of the batch campaign again")
+    parser.add_argument(
+        "--seeds", type=seeds_of, help="service: play these runs, such as 7 or 13000-13099, of batch or processes"
+    )
     parser.add_argument("--part", help="service, paper: do only this part")
-    return parser.parse_args(argv)
+    given = parser.parse_args(argv)
+    module = importlib.import_module(f"bench.{given.name}")
+    parts = getattr(module, "PARTS", {})
+    if given.part is not None and given.part not in parts:
+        parser.error(f"--part {given.part}: {given.name} has {', '.join(parts) or 'no parts'}")
+    if given.seeds is not None and given.name != "service":
+        parser.error(f"--seeds: {given.name} has no runs to be played one by one; service has")
+    if given.seeds is not None and given.part not in (None, *module.SEEDED):
+        parser.error(f"--seeds with --part {given.part}: choose from {', '.join(module.SEEDED)}")
+    return given, module
 
 
 def _value(figure: Figure) -> str:
@@ -40,16 +54,10 @@ def _verdict(figure: Figure) -> str:
     return {True: "holds", False: "MISSED", None: "-"}[figure.holds]
 
 
-def _seeds(seeds: list[int]) -> str:
-    if len(seeds) > 2 and seeds == list(range(seeds[0], seeds[-1] + 1)):
-        return f"{seeds[0]}-{seeds[-1]}"
-    return ", ".join(map(str, seeds))
-
-
 def table(figures: Iterable[Figure]) -> str:
     """Lay figures out as a Markdown table, aligned for a terminal too."""
     rows = [("figure", "value", "bar", "verdict", "seeds", "remark")]
-    rows += [(f.figure, _value(f), f.bar, _verdict(f), _seeds(f.seeds), f.reason) for f in figures]
+    rows += [(f.figure, _value(f), f.bar, _verdict(f), text_of(f.seeds), f.reason) for f in figures]
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
@@ -84,10 +92,9 @@ def _write(text: str, out: Path | None) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Measure, print, judge."""
-    arguments = _arguments(argv)
     begin_s, load = time.monotonic(), _load()
-    module = importlib.import_module(f"bench.{arguments.name}")
-    chosen = {name: value for name in ("seed", "part") if (value := getattr(arguments, name)) is not None}
+    arguments, module = _arguments(argv)
+    chosen = {name: value for name in ("seeds", "part") if (value := getattr(arguments, name)) is not None}
     say = partial(print, file=sys.stderr, flush=True)
     if arguments.out is not None:
         arguments.out.write_text("")

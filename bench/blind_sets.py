@@ -28,6 +28,7 @@ import numpy as np
 from pyarrow import csv
 
 from bench.blind_names import in_words_of_the_truth
+from bench.seeds import seeds_of
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.heap import keep_freed
 from stagectl.gap.log import Log
@@ -444,15 +445,6 @@ def closed_text(all_marked: Iterable[Marked]) -> str:
 
 
 # ---- command line ----------------------------------------------------------------------------------------------------
-
-
-def seeds_of(text: str) -> list[int]:
-    """Read `100-140,150` as seeds."""
-    seeds: list[int] = []
-    for part in text.split(","):
-        first, _, last = part.partition("-")
-        seeds += range(int(first), int(last or first) + 1)
-    return seeds
 
 
 def main(arguments: list[str] | None = None, say: Callable[[str], None] = print) -> int:

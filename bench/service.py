@@ -1,6 +1,7 @@
 """The service under faults: seeded runs in virtual time and with real processes, losses, pages, soak, mutants.
 
-`--seed N` plays one run of the batch campaign and says what was seen; `--part NAME` does one part. Without `--full`
+`--seeds 7` or `13000-13099` plays runs of the batch campaign, with `--part processes` those with real processes, and
+says what was seen of each; `--part NAME` does one part. Without `--full`
 the parts take 15 minutes together on a host of their own: every kind of fault in virtual time, ten runs with real
 processes, every fourth mutant; the last figure says how long they took. With it, an interrupted campaign goes on where
 its journal ends.
@@ -15,7 +16,7 @@ from bench.figure import Bar, Figure, judged
 
 ABOUT = (
     "Faults are injected in the rig, over the wire; judges read the rig's own log (`tests/faults/judge.py`). "
-    "A run is drawn from its seed: `python -m bench service --seed N` plays it again."
+    "A run is drawn from its seed: `python -m bench service --seeds N` plays it again."
 )
 
 Say = Callable[[str], None]
@@ -29,18 +30,17 @@ PARTS: dict[str, Callable[..., Iterator[Figure]]] = {
     "soak": service_processes.soak_figures,
 }
 """By the name that `--part` takes."""
+SEEDED: dict[str, Callable[..., Iterator[Figure]]] = {name: PARTS[name] for name in ("batch", "processes")}
+"""Of which `--seeds` plays runs."""
 ENDED = "parts that came to their end"
 TIME, TIME_FULL = Bar("all parts together", "s", 900.0), Bar("all parts together", "s")
 
 
-def figures(*, full: bool, say: Say, seed: int | None = None, part: str | None = None) -> Iterator[Figure]:
-    """Measure every row, or those of one part; with `seed`, of one run in batch."""
-    if seed is not None:
-        runs = service_processes.figures if part == "processes" else service_batch.figures
-        yield from runs(full=False, say=say, seeds=[seed])
+def figures(*, full: bool, say: Say, seeds: list[int] | None = None, part: str | None = None) -> Iterator[Figure]:
+    """Measure every row, or those of one part; with `seeds`, of these runs."""
+    if seeds is not None:
+        yield from SEEDED[part or "batch"](full=False, say=say, seeds=seeds)
         return
-    if part is not None and part not in PARTS:
-        raise SystemExit(f"bench service --part {part}: choose from {', '.join(PARTS)}")
     begin_s, took, broken, ended = time.monotonic(), [], [], 0
     if part is None and (reason := ten_pages.lacking()):
         say(f"pages will not be measured: {reason}")

@@ -125,6 +125,14 @@ def init(profile: "Profile", *, has_drives: bool) -> np.ndarray:
 
 
 @compiled
+def hear_drives(g: Record, m: Record) -> None:
+    """Count the cycles since each drive sent its process data last."""
+    if m.command_lost == 0:  # a SYNC that did not go out has no answer
+        g.macro_silence = 0.0 if m.tpdos_new & 1 else g.macro_silence + 1.0
+        g.micro_silence = 0.0 if m.tpdos_new & 2 or g.has_micro == 0.0 else g.micro_silence + 1.0
+
+
+@compiled
 def _drives_stop(g: Record, m: Record) -> int:
     """Return why the drives' own words end the run."""
     trip = int(g.input_trip_mask)
@@ -144,9 +152,7 @@ def _drives_stop(g: Record, m: Record) -> int:
     g.commands_lost = g.commands_lost + 1.0 if m.command_lost != 0 else 0.0
     if not g.commands_lost <= g.lost_commands:
         return _COMMAND_LOST
-    if m.command_lost == 0:  # a SYNC that did not go out has no answer
-        g.macro_silence = 0.0 if m.tpdos_new & 1 else g.macro_silence + 1.0
-        g.micro_silence = 0.0 if m.tpdos_new & 2 or g.has_micro == 0.0 else g.micro_silence + 1.0
+    hear_drives(g, m)
     if not g.micro_silence <= g.silent_cycles:
         return _LINK_SILENT
     if g.has_micro != 0.0 and m.micro_statusword & _STATE_MASK != _OPERATION_ENABLED:

@@ -14,7 +14,7 @@ import numpy as np
 from drivers import cia402
 from drivers.wire import HEARTBEAT_FRAME, SYNC_FRAME, Inbox, WireDecoder, WireEncoder
 from stagectl.fields import fields
-from stagectl.guard import NEGATIVE_LIMIT, POSITIVE_LIMIT, PRESSURE_LOW, SAFE_TORQUE_OFF
+from stagectl.guard import NEGATIVE_LIMIT, POSITIVE_LIMIT, PRESSURE_LOW, SAFE_TORQUE_OFF, hear_drives
 from stagectl.laws.reference import gap_centre
 from stagectl.rehearsal import Rehearsal
 from stagectl.requests import STATUS, TEXT_BYTES_COUNT, TICKING, Mode, Phase
@@ -245,6 +245,8 @@ class Servo:
         seen.overrun_ns = lateness_ns if lateness_ns > self._period_ns else 0
         seen.lease_left_ns = self._asked.lease_until_t_ns - t_ns
         seen.store()
+        if self.phase not in TICKING:
+            hear_drives(self.tracker.active.guard[0], self.tracker.measurement[0])
         macro_target, micro_target = self._advance_phase(t_ns)
         decided = self._decided
         stop = Stop.NONE
@@ -416,6 +418,9 @@ class Servo:
             return Stop.DIGITAL_INPUT, self._detail(Stop.DIGITAL_INPUT)
         if any(self._shows_other_mode(axis, mode) for axis in self._modes[mode]):
             return Stop.DRIVE_MODE, mode_detail(self.tracker.active.measurement[0], self._modes[mode], self._node_ids)
+        guard = self.tracker.active.guard
+        if not max(guard["macro_silence"][0], guard["micro_silence"][0]) <= guard["silent_cycles"][0]:
+            return Stop.LINK_SILENT, self._detail(Stop.LINK_SILENT)
         if mode is Mode.TRACK and seen.reference_lost != 0:
             return Stop.REFERENCE_LOST, self.decoder.reference_text
         if mode is Mode.TRACK and self.decoder.encoder_text:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from bench import blind_sets
-from bench.blind_sets import Job, Searched, held_out, line, load_set, marked, seeds_of, summary_lines
+from bench.blind_sets import Job, Searched, held_out, line, load_set, marked, summary_lines
+from bench.seeds import seeds_of
 from stagectl.gap import balance
 from stagectl.gap.effect_forces import known_forces
 from stagectl.gap.innovations import Noise

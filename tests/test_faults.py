@@ -395,6 +395,22 @@ def test_a_lost_reference_needs_a_homing(tmp_path, oled_profile, oled_machine):
     assert replay(tmp_path / "run").exact
 
 
+@pytest.mark.parametrize("at_s", [0.0, 0.015], ids=["before", "as it gets power"])
+@pytest.mark.parametrize(("can_id", "axis"), [(MACRO_TPDO, "macro"), (MICRO_TPDO, "micro")])
+def test_a_drive_that_sends_nothing_gets_no_power(at_s, can_id, axis, tmp_path, oled_profile, oled_machine):
+    """The other one had power for the 2 s that an arming may take, and the silent one was told to be off."""
+    one = Stage(tmp_path / "run", oled_profile, oled_machine)
+    with one:
+        one.backend.rig.inject(Fault("drop_frame", at_s=at_s, can_id=can_id, duration_s=5.0), one.backend.wire.t_ns)
+        asked_row = one.backend.servo.ring.written_count
+        assert one.stage.enable() is Stop.LINK_SILENT
+        assert re.match(rf"{axis} \(node [12]\): nothing for \d+ cycles, limit 20; ", one.stage.detail)
+    rows = read_run(tmp_path / "run").rows[asked_row:]
+    powered = rows["run_phase"] == Phase.ENABLING
+    assert powered.any() == (at_s > 0.0)
+    assert np.count_nonzero(powered) <= 21
+
+
 @pytest.mark.parametrize("offset_m", [-4.5e-3, 4.5e-3])
 def test_a_stage_whose_encoder_lies_stops_by_its_lasers(offset_m, tmp_path, oled_profile, oled_machine):
     """The drive's own stop ramps down on that encoder: it took a macro of 0.4 m/s to 0.7 and 55 mm too far."""

@@ -41,7 +41,7 @@ class Result:
         """One line for a table of violations, with how to see it again."""
         said = "; ".join(": ".join(one) for one in self.verdict.violations) if self.verdict else self.reason
         where = f"seed {self.seed}: {self.kind} ({self.text}), {self.phase}"
-        return f"{where}: {said or 'holds'}; python -m bench service --seed {self.seed}"
+        return f"{where}: {said or 'holds'}; python -m bench service --seeds {self.seed}"
 
 
 def drawn(seed: int) -> tuple[str, str, Drawn, np.random.Generator]:

@@ -178,9 +178,10 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     if not np.isfinite(detection_s):
         counts_from, detection_s = noticed or facts.fault_t_ns, CYCLE_S
     at = int(np.searchsorted(t_ns, counts_from))
+    asked_at = int(np.searchsorted(t_ns, _asked_until_t_ns(drawn, facts, counts_from, noticed)))
     dark = MACRO in drawn.without_power
     if facts.fault_kind and not _had_power(seen, facts.fault_t_ns if dark else counts_from, noticed, end):
-        found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
+        found += [(STANDSTILL, text) for text in _enabled_again(seen, asked_at, end)]
         found += _let_go(seen, int(np.searchsorted(t_ns, facts.fault_t_ns)), at)
     elif facts.fault_kind:
         rest = _rest(seen, at, end, noticed)
@@ -193,9 +194,9 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             stands = min(max(stands, free + SETTLED_SAMPLES), end)
             relative = seen["end_velocity_m_per_s"][at:stands] - velocity[at:stands]
             struck_m = of.struck_m(float(np.abs(relative).max(initial=0.0)))
-        if drawn.pushed:
+        if drawn.obstacle_m is not None:
             stands = min(max(stands, free + RELEASED_SAMPLES), end)
-            away_m = (position[at:stands] - position[at]) * np.sign(velocity[at])
+            away_m = (position[at:stands] - position[at]) * _goes_to(facts, at, drawn.obstacle_m)
             pushed_m = abs(float(position[stands - 1] - position[free]))
             back_m = OVERSHOOT * pushed_m + max(0.0, of.drive_gives_m - pushed_m)
         else:
@@ -207,17 +208,15 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         else:
             bound_m = back_m + _bound_m(t_ns, velocity, at, detection_s + facts.late_s, of, drawn.open_loop)
         if MICRO in drawn.without_power:
-            found += _too_far(seen, at, stands, of)
+            gone = np.flatnonzero(~np.isin(seen["states"][at:stands, 1], _POWERED))
+            found += _too_far(seen, at + int(gone[0]), stands, of) if gone.size else []
         if not travel_m <= bound_m + struck_m + STANDSTILL_M:
             found.append((TRAVEL, f"macro went {travel_m * 1e3:.3f} mm, bound {bound_m * 1e3:.3f} mm"))
         if rest is None and not dark:
             found.append((STANDSTILL, "it never stood still"))
-        asked_at = at  # an arming, or a homing, gives power until the fault is noticed
-        if facts.phase in ("arming", "homing"):
-            asked_at = end if noticed is None else int(np.searchsorted(t_ns, noticed))
         found += [(STANDSTILL, text) for text in _enabled_again(seen, asked_at, end)]
         held_m, drift_m = _moved_after(seen, stands, end)
-        if rest is not None and not drawn.pushed:
+        if rest is not None and drawn.obstacle_m is None:
             settled_m = float(np.abs(position[rest:stands] - position[rest]).max(initial=0.0))
             if settled_m > SETTLING_M + shifted_m + struck_m:
                 found.append((STANDSTILL, f"macro moved {settled_m * 1e6:.0f} um while it settled"))
@@ -290,6 +289,18 @@ def _bound_m(
     return v * t + 0.5 * a * t * t + (v + a * t) ** 2 / (2.0 * of.ramp_m_per_s2)
 
 
+def _goes_to(facts: Facts, at: int, obstacle_m: float) -> float:
+    """Return the direction that is forward at sample `at`: where it goes, or to the obstacle that it has struck.
+
+    What had struck one was on its way back when the stop began.
+    """
+    begin = int(np.searchsorted(facts.seen["t_ns"], facts.fault_t_ns))
+    away_m = facts.seen["macro_position_m"][begin : at + 1] - facts.seen["macro_position_m"][begin]
+    furthest_m = float(away_m[np.argmax(np.abs(away_m))])
+    struck = abs(furthest_m) >= obstacle_m
+    return float(np.sign(furthest_m if struck else facts.seen["macro_velocity_m_per_s"][at]))
+
+
 def _way_to_stops_m(velocity: np.ndarray, position: np.ndarray, at: int, end: int, of: Mechanics) -> float:
     """Return the way of an axis without power: to the stop that it coasts to; thrown back there, to the other."""
     low_m, high_m = of.machine.macro.travel_m
@@ -335,6 +346,17 @@ def _had_power(seen: dict[str, Any], fault_t_ns: int, noticed_t_ns: int | None, 
     at = max(int(np.searchsorted(seen["t_ns"], fault_t_ns)) - 1, 0)
     until = end if noticed_t_ns is None else int(np.searchsorted(seen["t_ns"], noticed_t_ns))
     return bool(np.isin(seen["states"][at : until + 1, 0], _POWERED).any())
+
+
+def _asked_until_t_ns(drawn: Drawn, facts: Facts, counts_from: int, noticed_t_ns: int | None) -> int:
+    """Return until when power was asked for: by an arming or a homing until its fault is, or must be, noticed."""
+    if facts.phase not in ("arming", "homing"):
+        return counts_from
+    until_t_ns = facts.judged_until_t_ns if noticed_t_ns is None else noticed_t_ns
+    if drawn.must_stop and np.isfinite(drawn.detection_s):
+        noticed_s = drawn.detection_s + facts.late_s + BEGUN_CYCLES * CYCLE_S
+        until_t_ns = min(until_t_ns, counts_from + round(1e9 * noticed_s))
+    return until_t_ns
 
 
 def _let_go(seen: dict[str, Any], at: int, end: int) -> list[tuple[str, str]]:

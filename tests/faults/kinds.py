@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sim_backend.drive_states import Order, order_of
 from sim_backend.faults import Fault
 from tests.faults.draws import between, one_of
 from tests.faults.nonsense import Nonsense, nonsense
@@ -31,6 +32,7 @@ _LEASE_S = 2.0  # what a lease lasts that nobody renews
 JOG_HOLD_S = 0.3  # for how long a word of a jog's operator holds
 FRAME_S = 130e-6  # eight bytes at 1 Mbit/s
 NEVER_S = float("inf")
+_ENABLE_OPERATION = 0x000F  # the controlword of a drive that follows
 
 MOVING = ("accelerating", "constant speed", "decelerating")
 PHASES = ("at rest", *MOVING, "jogging", "identifying", "homing", "stopping")
@@ -53,7 +55,7 @@ class Drawn:
     silent: bool = False  # the operator says nothing more: a jog ends by its own hold, before the lease does
     encoder_m: float = 0.0  # by which the drive's own encoder is off for a while: it holds on that
     swings: bool = False  # the end, with nothing that holds it: the macro's drive feels that while it settles
-    pushed: bool = False  # by something that is no command: how far is not judged
+    obstacle_m: float | None = None  # how far away one lies on both sides; by how much it pushes back is not judged
     by_lasers: bool = False  # of what only a law goes by: while the drive homes by itself it must stop nothing
     nonsense: Nonsense | None = None  # what the profile is edited to; it is read when the stage has no power
 
@@ -119,11 +121,25 @@ def frames_doubled(rng: np.random.Generator, phase: str) -> Drawn:
 
 
 def frames_corrupted(rng: np.random.Generator, phase: str) -> Drawn:
-    """Bits turn over behind the bus's own check: a gateway, a driver's bug."""
+    """Bits turn over behind the bus's own check: a gateway, a driver's bug.
+
+    Where they make another order of a controlword, the drive obeys: it stops, or its power is gone.
+    """
     can_id, count = one_of(rng, (*TPDOS, *RPDOS)), int(rng.integers(1, 6))
     bits = sum(1 << int(k) for k in rng.choice(32, size=int(rng.integers(1, 4)), replace=False))
     fault = Fault("corrupt_frame", can_id=can_id, bits=bits, count=count, duration_s=0.1)
-    return Drawn(f"{count} frames 0x{can_id:03X} with bits 0x{bits:08X}", (fault,), must_stop=False, lasts_s=0.1)
+    text, node_id = f"{count} frames 0x{can_id:03X} with bits 0x{bits:08X}", can_id & 0x7F
+    order = order_of(_ENABLE_OPERATION ^ bits & 0xFFFF) if can_id in RPDOS else Order.ENABLE_OPERATION
+    if order == Order.ENABLE_OPERATION:
+        return Drawn(text, (fault,), must_stop=False, lasts_s=0.1)
+    return Drawn(
+        text,
+        (fault,),
+        must_stop=phase != "homing",  # which gives a drive no power before it needs it
+        detection_s=AT_ONCE_S,
+        lasts_s=0.1,
+        without_power=() if order == Order.QUICK_STOP else (node_id,),
+    )
 
 
 def frames_short(rng: np.random.Generator, phase: str) -> Drawn:
@@ -358,7 +374,7 @@ def obstacle(rng: np.random.Generator, phase: str) -> Drawn:
     """Something lies in the way of the macro."""
     offset_m = between(rng, 1e-3, 60e-3)
     faults = tuple(Fault("obstacle", offset_m=side * offset_m, duration_s=1.5) for side in (-1.0, 1.0))
-    return Drawn(f"obstacles {offset_m * 1e3:.0f} mm away", faults, must_stop=False, lasts_s=1.5, pushed=True)
+    return Drawn(f"obstacles {offset_m * 1e3:.0f} mm away", faults, must_stop=False, lasts_s=1.5, obstacle_m=offset_m)
 
 
 def host_held_up(rng: np.random.Generator, phase: str) -> Drawn:

@@ -84,7 +84,7 @@ class RealResult:
     def line(self) -> str:
         """One line for a table."""
         said = "; ".join(": ".join(one) for one in self.violations) or self.skipped or "holds"
-        again = f"python -m bench service --part processes --seed {self.seed}"
+        again = f"python -m bench service --part processes --seeds {self.seed}"
         return f"real processes, seed {self.seed}: {self.scenario.kind} ({self.scenario.text}): {said}; {again}"
 
 

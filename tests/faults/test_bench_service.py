@@ -13,6 +13,7 @@ import pyarrow as pa
 import pytest
 
 from bench import service, service_batch, service_mutants, service_processes
+from bench.__main__ import main
 from bench.figure import judged
 from bench.journal import APART, Journal, beside_figures, sources, sources_hash
 from bench.mutation import mutants, put, trial, uncompiled
@@ -47,7 +48,7 @@ def entry(kind: str, *violations: tuple[str, str], lost: int = 0, skipped: str =
         "kind": kind,
         "phase": "at rest",
         "fault": "EMERGENCY",
-        "line": f"{kind}: python -m bench service --seed 1",
+        "line": f"{kind}: python -m bench service --seeds 1",
         "skipped": skipped,
         "took_s": 1.0,
         "violations": [list(one) for one in violations],
@@ -62,7 +63,7 @@ def test_one_bad_run_is_a_missed_bar_and_says_how_to_see_it_again():
     entries = [entry("EMCY"), entry("EMCY", (TRAVEL, "5 mm"), (BACK, "no")), entry("disk full", skipped="no root")]
     found = {figure.figure: figure for figure in service_batch.of_entries(entries, [0, 1, 2])}
     assert found[f"batch: {TRAVEL}"].holds is False
-    assert "python -m bench service --seed 1" in found[f"batch: {TRAVEL}"].reason
+    assert "python -m bench service --seeds 1" in found[f"batch: {TRAVEL}"].reason
     assert found[f"batch: {LOST}"].holds is True
     assert found["batch: runs"].value == 2
     assert found["batch: runs"].reason == "1 skipped: no root"
@@ -433,8 +434,25 @@ def test_cycles_lost_with_real_processes_are_a_missed_bar(monkeypatch):
 
 def test_parts_are_named():
     assert set(service.PARTS) == {"batch", "processes", "losses", "pages", "soak", "mutants"}
-    with pytest.raises(SystemExit, match="choose from mutants, batch, "):
-        list(service.figures(full=False, say=lambda text: None, part="nothing"))
+    assert set(service.SEEDED) < set(service.PARTS)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (["service", "--part", "nothing"], "--part nothing: service has mutants, batch, "),
+        (["gap", "--part", "speed"], "--part speed: gap has no parts"),
+        (["paper", "--seeds", "7"], "--seeds: paper has no runs"),
+        (["service", "--part", "soak", "--seeds", "7"], "--seeds with --part soak: choose from batch, processes"),
+        (["service", "--seeds", "seven"], "argument --seeds: invalid seeds_of value: 'seven'"),
+        (["service", "--seeds", "9-7"], "argument --seeds: invalid"),
+    ],
+)
+def test_what_cannot_be_measured_is_wrong_usage(asked, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(asked)
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
 
 
 def test_mutants_are_small_changes_that_differ_from_the_code_and_from_each_other():

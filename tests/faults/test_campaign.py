@@ -28,9 +28,10 @@ from tests.faults.nonsense import nonsense
 from tests.faults.scene import PROFILE, Facts
 from tests.faults.witness import ENABLED
 
-SEEDS = (8, 12, 46, 162, 183, 230)
+SEEDS = (8, 12, 46, 162, 183, 230, 13095)
 """46: a macro position that stands still while the macro moves. 162: an obstacle that was pressed for a second is gone.
 183: a stop in an identification sent the macro off. 230: a macro that swung back was taken for one that stands.
+13095: a bit that turned over took the macro's power while it moved.
 """
 _STOPPED = 5  # QUICK_STOP_ACTIVE
 
@@ -46,6 +47,20 @@ def test_every_kind_is_drawn_and_a_seed_is_the_same_run_again():
     drawn = [campaign.drawn(seed) for seed in range(len(KINDS))]
     assert [kind for kind, *_ in drawn] == list(KINDS)
     assert [one[2].text for one in drawn] == [campaign.drawn(seed)[2].text for seed in range(len(KINDS))]
+
+
+@pytest.mark.parametrize(
+    ("bits", "without_power"), [(0x1, True), (0x2, True), (0x4, False), (0x6, True), (0x8, True), (0x30080, False)]
+)
+def test_a_controlword_that_asks_for_no_power_takes_it(bits, without_power):
+    """CiA 402: bit 2 alone is a quick stop; bits 0, 1 and 3 are enable voltage, switch on, enable operation."""
+    kind = list(KINDS).index("frames corrupted")
+    drawn = [campaign.drawn(seed)[2] for seed in range(kind, 15000, len(KINDS))]
+    to_drives = [one for one in drawn if one.faults[0].can_id in (0x201, 0x202)]
+    of_bits = [one for one in to_drives if one.faults[0].bits & 0xF == bits & 0xF]
+    assert of_bits
+    for one in of_bits:
+        assert one.without_power == ((one.faults[0].can_id & 0x7F,) if without_power else ())
 
 
 def rest_after(ramp_m_per_s2: float, noticed_s: float = 0.02) -> tuple[Facts, Record]:
@@ -217,6 +232,21 @@ def test_a_macro_that_a_homing_had_let_go_of_rolls_and_was_at_rest_then(speed_m_
     assert bars_missed(facts, record, stuck) == missed | {STANDSTILL}
 
 
+@pytest.mark.parametrize(
+    ("phase", "given_at", "missed"),
+    [("homing", 1010, set()), ("homing", 1060, {STANDSTILL}), ("stopping", 1010, {STANDSTILL})],
+)
+def test_a_homing_gives_power_until_its_fault_has_to_be_noticed(phase, given_at, missed):
+    """However late it is noticed: a macro that told nothing was waited for for 2 s, while the micro had power."""
+    facts, record = rest_after(2.0, noticed_s=0.1)
+    facts.phase = phase
+    for name in ("macro_velocity_m_per_s", "end_velocity_m_per_s", "macro_position_m", "end_position_m"):
+        facts.seen[name][:] = 0.0
+    facts.seen["states"][:] = 1
+    facts.seen["states"][given_at:1100, 1] = ENABLED
+    assert bars_missed(facts, record) == missed
+
+
 def test_judges_see_a_drive_that_creeps_on_before_it_stands():
     """What it does in the 0.2 s behind |v| < 1 mm/s is travel, and no more than a loop that settles."""
     facts, record = rest_after(2.0)
@@ -252,7 +282,7 @@ def test_judges_see_a_micro_whose_winding_was_left_open():
     assert bars_missed(facts, record, dark) == {LIMP}
 
 
-PUSHED = replace(FAULT, pushed=True, lasts_s=0.3)
+PUSHED = replace(FAULT, obstacle_m=20e-3, lasts_s=0.3)
 
 
 def test_an_obstacle_pushes_back_and_the_stop_s_own_end_is_all_that_it_comes_back_to():
@@ -267,6 +297,20 @@ def test_an_obstacle_pushes_back_and_the_stop_s_own_end_is_all_that_it_comes_bac
     position[1300:] = ended_m
     position[1850:] += 30e-6
     assert bars_missed(facts, record, PUSHED) == {STANDSTILL}
+
+
+@pytest.mark.parametrize(("obstacle_m", "missed"), [(3e-3, set()), (20e-3, {TRAVEL})])
+def test_what_had_struck_an_obstacle_when_its_stop_began_is_thrown_back(obstacle_m, missed):
+    """Where none was struck, what goes that way goes forward."""
+    facts, record = rest_after(2.0)
+    position, velocity = facts.seen["macro_position_m"], facts.seen["macro_velocity_m_per_s"]
+    back_m_per_s = np.where(np.arange(2000) < 1020, 0.05, 0.2)
+    thrown = slice(1010, 1200)
+    position[thrown] = position[1009] - 1e-3 * np.cumsum(back_m_per_s[thrown])
+    velocity[thrown] = -back_m_per_s[thrown]
+    position[1200:], velocity[1200:] = position[1199], 0.0
+    noticed = replace(PUSHED, detection_s=float("inf"), obstacle_m=obstacle_m)
+    assert bars_missed(facts, record, noticed) == missed
 
 
 def test_what_a_plan_may_gain_counts_only_where_speed_was_gained():
