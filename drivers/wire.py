@@ -143,6 +143,7 @@ class WireDecoder:
         self._encoder_m = self._encoder_step_m = math.nan
         self._encoder_cycles = 0  # since it came last
         self._encoder_jump_sequence = -1  # sample at which it left its own way last
+        self.encoder_jumps = 0  # how often
         self._position_mode = profile.macro.mode == "position"
         self.encoder_trusted = False  # only after a homing do laser and encoder share a zero
         self.samples_lost = 0
@@ -377,6 +378,7 @@ class WireDecoder:
         step_m = (encoder_m - self._encoder_m) / self._encoder_cycles
         if abs(step_m - self._encoder_step_m) > self._gain_limit_m:
             self._encoder_jump_sequence = self.sequence
+            self.encoder_jumps += 1
         self._encoder_m, self._encoder_step_m, self._encoder_cycles = encoder_m, step_m, 0
 
     def _look_for_stuck_counts(self, encoder_m: float) -> None:
@@ -489,6 +491,7 @@ class WireDecoder:
         "_encoder_step_m",
         "_encoder_cycles",
         "_encoder_jump_sequence",
+        "encoder_jumps",
         "_disagreements",
         "_macro_moved",
         "_end_moved",

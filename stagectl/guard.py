@@ -13,6 +13,14 @@ from stagectl.signals import MODES, Record, Stop
 if TYPE_CHECKING:
     from stagectl.profile import Profile
 
+ASKED_CYCLES = 3
+"""A force is reported with the SYNC behind the one that asked for it, and read a cycle later; one more for a frame that
+is late by a cycle. In undisturbed motions of the rig the force is that of one of them but for 1 N of 180."""
+
+UNHEEDED_CYCLES, _HEEDED_SHARE = 6.0, 0.1
+"""A loop whose commands come 3 to 5 ms late rings: every other half wave is as it was asked for. It is told 45 to 65 ms
+behind the first late frame, and has not begun to shake the stage then; its end left its reference 20 to 45 ms later."""
+
 GUARD = np.dtype(
     [
         ("travel_low_m", "f8"),
@@ -50,6 +58,14 @@ GUARD = np.dtype(
         ("micro_heat_n2", "f8"),
         ("macro_silence", "f8"),
         ("micro_silence", "f8"),
+        ("macro_n_per_word", "f8"),  # what one of the integers on the wire asks of a drive
+        ("micro_n_per_word", "f8"),
+        ("macro_off_n", "f8"),  # by which a drive may report another force than it was asked for
+        ("micro_off_n", "f8"),
+        ("macro_asked_n", "f8", (ASKED_CYCLES,)),  # of it lately
+        ("micro_asked_n", "f8", (ASKED_CYCLES,)),
+        ("macro_unheeded", "f8"),  # cycles with another force, less a tenth of those without
+        ("micro_unheeded", "f8"),
         ("commands_lost", "f8"),
         ("late_cycles", "f8"),  # in a row, each more than `_LATE_CYCLES` ahead of its newest sample
     ]
@@ -85,6 +101,7 @@ _DRIVE_MODE = int(Stop.DRIVE_MODE)
 _DIGITAL_INPUT = int(Stop.DIGITAL_INPUT)
 _EMERGENCY = int(Stop.EMERGENCY)
 _LINK_SILENT = int(Stop.LINK_SILENT)
+_FORCE_UNHEEDED = int(Stop.FORCE_UNHEEDED)
 _COMMAND_LOST = int(Stop.COMMAND_LOST)
 
 
@@ -110,12 +127,16 @@ def init(profile: "Profile", *, has_drives: bool) -> np.ndarray:
     g["lost_commands"] = max(3.0, trip.sensor_age_s / period_s)
     g["input_trip_mask"] = NEGATIVE_LIMIT | POSITIVE_LIMIT | SAFE_TORQUE_OFF | PRESSURE_LOW
     g["macro_mode"] = MODES[macro.mode]
+    g["macro_n_per_word"] = macro.torque_step_n
+    g["macro_off_n"] = trip.force_error_ratio * macro.force_limit_n if macro.mode == "torque" else np.inf
     g["velocity_share"] = _VELOCITY_SHARE
     g["macro_thermal_n"] = macro.thermal_force_n
     g["macro_thermal_share"] = period_s / macro.thermal_time_constant_s
     if micro is not None:
         g["has_micro"] = 1.0
         g["micro_mode"] = MODES["torque"]
+        g["micro_n_per_word"] = micro.torque_step_n
+        g["micro_off_n"] = trip.force_error_ratio * micro.force_limit_n
         g["micro_force_limit_n"] = micro.force_limit_n
         g["stroke_low_m"] = micro.stroke_m[0] * STROKE_SHARE
         g["stroke_high_m"] = micro.stroke_m[1] * STROKE_SHARE
@@ -130,6 +151,26 @@ def hear_drives(g: Record, m: Record) -> None:
     if m.command_lost == 0:  # a SYNC that did not go out has no answer
         g.macro_silence = 0.0 if m.tpdos_new & 1 else g.macro_silence + 1.0
         g.micro_silence = 0.0 if m.tpdos_new & 2 or g.has_micro == 0.0 else g.micro_silence + 1.0
+
+
+@compiled
+def ask(g: Record, macro_word: int, micro_word: int) -> None:
+    """Note what is sent to the drives in this cycle."""
+    for k in range(ASKED_CYCLES - 1, 0, -1):
+        g.macro_asked_n[k] = g.macro_asked_n[k - 1]
+        g.micro_asked_n[k] = g.micro_asked_n[k - 1]
+    g.macro_asked_n[0] = macro_word * g.macro_n_per_word
+    g.micro_asked_n[0] = micro_word * g.micro_n_per_word
+
+
+@compiled
+def _unheeded(before: float, reported_n: float, asked_n: np.ndarray, off_n: float) -> float:
+    """Return the count of cycles in which a drive reported another force than it was asked for lately; nan by nan."""
+    low_n, high_n = asked_n.min(), asked_n.max()
+    beside_n = abs(reported_n - 0.5 * (low_n + high_n)) - 0.5 * (high_n - low_n)
+    if beside_n <= off_n:
+        return max(before - _HEEDED_SHARE, 0.0)
+    return before + 1.0 if beside_n > off_n else np.nan
 
 
 @compiled
@@ -157,12 +198,20 @@ def _drives_stop(g: Record, m: Record) -> int:
         return _LINK_SILENT
     if g.has_micro != 0.0 and m.micro_statusword & _STATE_MASK != _OPERATION_ENABLED:
         return _DRIVE_FAULT
+    if g.has_micro != 0.0 and m.command_lost == 0 and m.tpdos_new & 2:
+        g.micro_unheeded = _unheeded(g.micro_unheeded, m.micro_reported_force_n, g.micro_asked_n, g.micro_off_n)
+    if not g.micro_unheeded <= UNHEEDED_CYCLES:
+        return _FORCE_UNHEEDED
     if g.braking != 0.0:
         return _NONE
     if not g.macro_silence <= g.silent_cycles:
         return _LINK_SILENT
     if m.macro_statusword & _STATE_MASK != _OPERATION_ENABLED:
         return _DRIVE_FAULT
+    if m.command_lost == 0 and m.tpdos_new & 1:
+        g.macro_unheeded = _unheeded(g.macro_unheeded, m.macro_reported_force_n, g.macro_asked_n, g.macro_off_n)
+    if not g.macro_unheeded <= UNHEEDED_CYCLES:
+        return _FORCE_UNHEEDED
     return _NONE
 
 

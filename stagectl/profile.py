@@ -97,6 +97,7 @@ class Trip(Table):
     rpdo_deadline_s: Annotated[float, within(0.001, 1.0)]
     supervisor_silence_s: Annotated[float, within(0.05, 10.0)]
     lease_s: Annotated[float, within(0.05, 60.0)]
+    force_error_ratio: Annotated[float, within(0.005, 1.0)] = 0.05  # of a drive's greatest force; 1 where it tells none
 
 
 class Can(Table):

@@ -14,7 +14,7 @@ import numpy as np
 from drivers import cia402
 from drivers.wire import HEARTBEAT_FRAME, SYNC_FRAME, Inbox, WireDecoder, WireEncoder
 from stagectl.fields import fields
-from stagectl.guard import NEGATIVE_LIMIT, POSITIVE_LIMIT, PRESSURE_LOW, SAFE_TORQUE_OFF, hear_drives
+from stagectl.guard import NEGATIVE_LIMIT, POSITIVE_LIMIT, PRESSURE_LOW, SAFE_TORQUE_OFF, UNHEEDED_CYCLES, hear_drives
 from stagectl.laws.reference import gap_centre
 from stagectl.rehearsal import Rehearsal
 from stagectl.requests import STATUS, TEXT_BYTES_COUNT, TICKING, Mode, Phase
@@ -53,6 +53,7 @@ _GUIDED_STOPS = (
     Stop.EMERGENCY,
     Stop.LINK_SILENT,
     Stop.DRIVE_MODE,
+    Stop.FORCE_UNHEEDED,
 )
 """Stops after which sensor and law can be trusted with the micro until the macro is slow, where its drive can."""
 
@@ -69,6 +70,7 @@ _DRIVE_HOMES = (Phase.HOMING_DRIVE, Phase.HOMED_DRIVE)
 
 _HELD_S, _HELD_M = 0.02, 1e-4
 """How far a macro may be from where its drive held it that long before: settled, it moves 1.4 um (three machines)."""
+_JUMP_SETTLES_NS, _JUMPS_NS = 200_000_000, 1_000_000_000
 _STARTS_S = 0.05  # in which a drive takes back the bits of a search before this one
 _ATTAINED_S = 0.05  # in which a drive counts from its index on, and settles there
 
@@ -144,6 +146,8 @@ class Servo:
         self._offsets = {name: layout[name][1] for name in ROW.names or ()}
         self._homing_id = 0
         self._searches = False  # the macro's drive has power for its homing
+        self._encoder_jumps = 0  # of the encoder that the index is held on
+        self._jumped_t_ns = self._jumps_from_t_ns = 0  # when it did last, and first, while it is held; 0: at no time
         self._held_m = float("nan")  # where it holds its index, smoothed; nan: not looked at yet
         self._stated_text = ""
         self._status = np.zeros(1, STATUS)
@@ -309,8 +313,10 @@ class Servo:
         obeys = is_enabled and not self._shows_other_mode("micro", Mode.TRACK)
         tripped = seen.micro_digital_inputs & (_INTERLOCKS | _LIMIT_SWITCHES)
         failed = seen.emergency >> 16 == self._node_ids["micro"]
-        silent = self.tracker.active.guard["micro_silence"][0] > 0.0
-        return obeys and not tripped and not failed and not (silent and stop is Stop.LINK_SILENT)
+        guard = self.tracker.active.guard
+        silent = stop is Stop.LINK_SILENT and guard["micro_silence"][0] > 0.0
+        unheeded = stop is Stop.FORCE_UNHEEDED and guard["micro_unheeded"][0] > UNHEEDED_CYCLES
+        return obeys and not tripped and not failed and not silent and not unheeded
 
     def _shows_other_mode(self, axis: str, mode: Mode) -> bool:
         """Tell whether a drive has told another mode of operation (0x6061) than it works in where `mode` is asked."""
@@ -446,6 +452,8 @@ class Servo:
         mode = Mode(self._asked.mode)
         in_phase_s = (t_ns - self._phase_since_t_ns) * 1e-9
         macro_state = cia402.state_of(seen.macro_statusword)
+        if self.phase is Phase.HOMED_DRIVE and self._settles_on_a_jump(t_ns):
+            return on, off
         if self.phase in (Phase.IDLE, Phase.HOMED_DRIVE):
             wanted = mode is Mode.TRACK or (mode is Mode.HOME_DRIVE and self.phase is Phase.IDLE)
             if wanted and not silent:
@@ -617,12 +625,34 @@ class Servo:
             progress = cia402.homing_of(seen.macro_statusword)
             if progress is cia402.Homing.ATTAINED:
                 self._enter(Phase.HOMED_DRIVE, t_ns)
+                self._jumped_t_ns = self._jumps_from_t_ns = 0
                 return on, off
             if progress in (cia402.Homing.ERROR, cia402.Homing.ERROR_MOVING):
                 text = "no index on this side; check index, limit switches and macro.homing"
                 self._end(Stop.HOMING_GIVEN_UP, Phase.QUICK_STOP, t_ns, text)
                 return cia402.State.QUICK_STOP_ACTIVE, off
         return on, off
+
+    def _settles_on_a_jump(self, t_ns: int) -> bool:
+        """Tell whether the macro's encoder jumped so lately that its drive still makes for where that says it was.
+
+        It does so within its loop's time, and stands by the way of the jump aside. Stopped at once, it ramped down from
+        the speed of a jump of 0.6 mm in a cycle: 7.7 mm. It is stopped when it stands.
+        """
+        if (t_ns - self._phase_since_t_ns) * 1e-9 <= _ATTAINED_S:
+            self._encoder_jumps = self.decoder.encoder_jumps
+        if self.decoder.encoder_jumps != self._encoder_jumps:
+            self._encoder_jumps, self._jumped_t_ns = self.decoder.encoder_jumps, t_ns
+            self._jumps_from_t_ns = self._jumps_from_t_ns or t_ns
+        if not self._jumped_t_ns:
+            return False
+        if t_ns - self._jumped_t_ns <= _JUMP_SETTLES_NS and t_ns - self._jumps_from_t_ns <= _JUMPS_NS:
+            return True
+        text = (
+            "while the drive held its index, it jumped by more than the motor moves in a cycle; check encoder and cable"
+        )
+        self._end(Stop.ENCODER_LOST, Phase.QUICK_STOP, t_ns, text)
+        return False
 
     def _holds_index(self, in_phase_s: float) -> bool:
         """Tell whether the macro is where its drive held it; no law or guard looks at it meanwhile.

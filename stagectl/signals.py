@@ -116,6 +116,7 @@ class Stop(IntEnum):
     HOMING_GIVEN_UP = 26
     ENCODER_LOST = 27
     DRIVE_MODE = 28
+    FORCE_UNHEEDED = 29
 
 
 STOP_TEXT = {
@@ -148,6 +149,7 @@ STOP_TEXT = {
     Stop.HOMING_GIVEN_UP: "the macro's drive gave its homing up",
     Stop.ENCODER_LOST: "the encoder of the macro's drive lies",
     Stop.DRIVE_MODE: "a drive works in another mode of operation than it is commanded in",
+    Stop.FORCE_UNHEEDED: "a drive gives another force than it is asked for",
 }
 
 

@@ -7,7 +7,14 @@ import math
 from typing import Any
 
 from drivers import cia402
-from stagectl.guard import NEGATIVE_LIMIT, POSITIVE_LIMIT, PRESSURE_LOW, SAFE_TORQUE_OFF
+from stagectl.guard import (
+    ASKED_CYCLES,
+    NEGATIVE_LIMIT,
+    POSITIVE_LIMIT,
+    PRESSURE_LOW,
+    SAFE_TORQUE_OFF,
+    UNHEEDED_CYCLES,
+)
 from stagectl.signals import MODE_TOLD, Stop
 
 _AWAY = {NEGATIVE_LIMIT: "positive", POSITIVE_LIMIT: "negative"}
@@ -36,7 +43,7 @@ def stop_detail(stop: Stop, m: Any, now: Any, command: Any, g: Any, node_ids: di
         return f"{law} asked {asked}; look for nan in the belief and the setpoints of this run"
     if stop is Stop.DRIVE_MODE:
         return mode_detail(m, {axis: int(g[f"{axis}_mode"]) for axis in node_ids}, node_ids)
-    if stop in (Stop.DRIVE_FAULT, Stop.LINK_SILENT, Stop.EMERGENCY, Stop.DIGITAL_INPUT):
+    if stop in _REMEDIES or stop is Stop.EMERGENCY:
         return _drives(stop, m, g, node_ids)
     return ""
 
@@ -157,6 +164,13 @@ def _drives(stop: Stop, m: Any, g: Any, node_ids: dict[str, int]) -> str:
             cycles, limit = int(g[f"{axis}_silence"]), int(g["silent_cycles"])
             if cycles > limit:
                 said.append(f"{name}: nothing for {cycles} cycles, limit {limit}")
+        elif stop is Stop.FORCE_UNHEEDED:
+            if g[f"{axis}_unheeded"] > UNHEEDED_CYCLES:
+                asked_n, reported_n = g[f"{axis}_asked_n"], m[f"{axis}_reported_force_n"]
+                asked = f"{min(asked_n):.1f} .. {max(asked_n):.1f} N in the last {ASKED_CYCLES} cycles"
+                said.append(
+                    f"{name} reports {reported_n:.1f} N, asked were {asked}, allowed {g[f'{axis}_off_n']:.1f} N beside"
+                )
         elif state is not cia402.State.OPERATION_ENABLED:
             said.append(f"{name} is in {state.name}, statusword 0x{word:04X}")
     return f"{'; '.join(said)}; {remedy}" if said else remedy
@@ -166,6 +180,8 @@ _REMEDIES = {
     Stop.DIGITAL_INPUT: "clear the cause, then acknowledge",
     Stop.LINK_SILENT: "check the drive's power and the CAN cable",
     Stop.DRIVE_FAULT: "read the drive, then acknowledge",
+    Stop.FORCE_UNHEEDED: "look for what delays frames, who else commands the drive, and a limit in the drive itself; "
+    "one that tells its force late or not at all needs another trip.force_error_ratio",
 }
 
 

@@ -276,6 +276,7 @@ def tick(measurement, setpoint, later, command, e, model, ahead, after, l, g, b,
         + 0.5 * h * (goal.acceleration_m_per_s2 - goal.relative_acceleration_m_per_s2))
     c.macro_force_n = c.macro_word * macro_step_n
     c.micro_force_n = c.micro_word * micro_step_n
+    guard.ask(g[0], c.macro_word, c.micro_word)
     x.macro_word = c.macro_word
     x.micro_word = c.micro_word
 '''

@@ -236,6 +236,48 @@ def test_a_word_from_the_drives_ends_the_silence(cycle):
         assert cycle.next(tpdos_new=3 if k % 20 == 19 else 0) is Stop.NONE
 
 
+@pytest.mark.parametrize(("axis", "allowed_n"), [("macro", 100.0), ("micro", 9.0)])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_drive_that_gives_another_force(oled_profile, axis, allowed_n, sign):
+    """By more than 5 % of its greatest one from all that it was asked for in three cycles, in seven cycles."""
+    one = Cycle(oled_profile)
+    word = round(sign * 120.0 / oled_profile.axis(axis).torque_step_n)
+    guard.ask(one.guard[0], *((word, 0) if axis == "macro" else (0, word)))
+    told = f"{axis}_reported_force_n"
+    for reported_n in (0.0, 120.0, 60.0, 120.0 + 0.99 * allowed_n, -0.99 * allowed_n):
+        assert all(one.next(**{told: sign * reported_n}) is Stop.NONE for _ in range(50)), reported_n
+    assert [one.next(**{told: sign * (120.0 + 1.01 * allowed_n)}) for _ in range(7)] == [
+        *[Stop.NONE] * 6,
+        Stop.FORCE_UNHEEDED,
+    ]
+    text = stop_detail(
+        Stop.FORCE_UNHEEDED, one.measurement[0], None, None, one.guard[0], {"macro": 1, "micro": 2}, "dsmc"
+    )
+    assert text.startswith(f"{axis} (node {1 if axis == 'macro' else 2}) reports ")
+    assert f"allowed {allowed_n:.1f} N beside; look for what delays frames" in text
+    for _ in range(guard.ASKED_CYCLES):  # what it was asked for before is of no use
+        guard.ask(one.guard[0], 0, 0)
+    one.guard[f"{axis}_unheeded"] = 0.0
+    assert after_many(7, **{told: sign * 120.0})(one) is Stop.FORCE_UNHEEDED
+
+
+def test_a_force_that_is_wrong_now_and_then_is_none_that_goes_unheeded(cycle):
+    """Five frames in a row whose bits turned over; every ninth cycle for good."""
+    for k in range(2000):
+        wrong = k % 70 < 5 or (k > 1000 and k % 11 == 0)
+        assert cycle.next(macro_reported_force_n=500.0 if wrong and k % 70 < 5 else 0.0) is Stop.NONE
+
+
+def test_a_force_that_is_not_told_or_not_asked_for_is_not_judged(oled_profile):
+    one = Cycle(oled_profile)
+    one.set(macro_reported_force_n=500.0, micro_reported_force_n=100.0)
+    assert [one.next(tpdos_new=k % 2 * 3) for k in range(12)] == [Stop.NONE] * 12
+    one = Cycle(with_values(oled_profile, macro__mode="position", macro__encoder_step_m=1e-6))
+    assert after_many(100, macro_reported_force_n=500.0)(one) is Stop.NONE
+    one = Cycle(with_values(oled_profile, trip__force_error_ratio=1.0))
+    assert after_many(100, macro_reported_force_n=500.0)(one) is Stop.NONE
+
+
 def test_commands_that_do_not_reach_the_bus(cycle):
     for _ in range(20):
         assert cycle.next(command_lost=1) is Stop.NONE
@@ -539,6 +581,7 @@ WAYS = {
     Stop.EMERGENCY: lambda one: one.set(emergency=1).stop(),
     Stop.LINK_SILENT: after_many(tpdos_new=0),
     Stop.COMMAND_LOST: after_many(command_lost=1),
+    Stop.FORCE_UNHEEDED: after_many(macro_reported_force_n=101.0),
 }
 
 

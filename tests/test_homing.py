@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drivers import cia402
+from sim_backend.drive_states import DriveState
 from sim_backend.faults import Fault
 from sim_backend.machine import load_machine
 from stagectl.backend import BatchBackend
@@ -227,6 +228,38 @@ def test_a_drive_that_is_sent_off_its_index_is_stopped(tells, tmp_path, single_p
     assert (0.0 if tells else 0.01) < fastest_m_per_s < (0.06 if tells else 0.12)
     assert np.ptp(truth["macro_position_m"][away]) < (0.5e-3 if tells else 1.5e-3)  # of the 2 mm that it was sent
     assert not read_run(tmp_path / "run").rows["homing_id"].any()
+
+
+@pytest.mark.parametrize("for_s", [0.317, 1e3], ids=["and comes back", "for good"])
+def test_an_encoder_that_jumps_while_the_index_is_held_on_it_is_no_reason_to_ramp_down(
+    for_s, tmp_path, oled_profile, oled_machine
+):
+    """Its drive goes with it, by that and its loop's overshoot; stopped at once it made 7.7 mm of a jump of 0.6 mm."""
+    backend = BatchBackend(oled_machine, seed=1)
+    held_t_ns: list[int] = []
+    jumped_t_ns = 0
+
+    def strike(rows):
+        nonlocal jumped_t_ns
+        held_t_ns.extend(rows["t_ns"][rows["run_phase"] == Phase.HOMED_DRIVE])
+        if not jumped_t_ns and held_t_ns and backend.wire.t_ns - held_t_ns[0] > 60_000_000:
+            jumped_t_ns = backend.wire.t_ns
+            fault = Fault("encoder_jump", node_id=MACRO, offset_m=-590e-6, duration_s=for_s)
+            backend.rig.inject(fault, jumped_t_ns)
+
+    with Supervisor(oled_profile, backend, tmp_path / "run", observe=strike) as stage:
+        outcome = stage.home()
+        stage.pump(1.0)
+        truth = backend.rig.truth.arrays()
+    assert outcome.stop is Stop.ENCODER_LOST
+    assert outcome.detail.startswith(
+        "while the drive held its index, it jumped by more than the motor moves in a cycle"
+    )
+    held = (truth["t_ns"] > jumped_t_ns) & (truth["macro_drive_state"] != DriveState.SWITCH_ON_DISABLED)
+    moved_m = np.abs(truth["macro_position_m"][held] - truth["macro_position_m"][held][0]).max()
+    assert 0.5e-3 < moved_m < 1.2 * 590e-6
+    rows = read_run(tmp_path / "run").rows
+    assert not rows["homing_id"].any()
 
 
 PATIENT = {"trip__sensor_age_s": 0.3, "trip__overrun_s": 0.3, "trip__rpdo_deadline_s": 0.1}

@@ -175,6 +175,21 @@ def test_clock_that_jumps_is_found_again(jump_ns):
     assert rms((recovered_ns - true_ns)[7500:]) < 300.0
 
 
+@pytest.mark.parametrize(
+    ("off_ppm", "begins", "lasts"), [(7633.0, 6000, 272), (-1000.0, 6000, 300), (3000.0, 18_000, 600)]
+)
+def test_a_clock_that_was_off_for_a_while_is_found_again(off_ppm, begins, lasts):
+    """The corner that it leaves bends the line by less than crystals differ: 2 ms off 6 s later."""
+    count = begins + 8000
+    true_ns, arrivals_t_ns = sensor(10, count)
+    gained_ns = np.cumsum(np.where((np.arange(count) >= begins) & (np.arange(count) < begins + lasts), off_ppm, 0.0))
+    state = sample_clock.init(PERIOD_NS, TRANSPORT_NS)
+    recovered_ns, _ = recover(state, np.arange(count), arrivals_t_ns - np.round(gained_ns).astype(np.int64))
+    error_ns = recovered_ns - (true_ns - gained_ns)
+    assert np.abs(error_ns[begins + lasts + 600 :]).max() < 0.35 * PERIOD_NS
+    assert np.abs(error_ns[begins + lasts + 1600 :]).max() < 0.01 * PERIOD_NS
+
+
 def test_hiccups_of_the_host_do_no_harm():
     """20 lines that wait 8 ms for the host, ten times."""
     true_ns, arrivals_t_ns = sensor(7, 10_000)

@@ -30,6 +30,7 @@ _REMEDY = {
     Stop.HOMING_GIVEN_UP: "check index, limit switches and macro.homing, acknowledge, then home",
     Stop.ENCODER_LOST: "check the encoder, its cable and the drive, acknowledge, then home",
     Stop.DRIVE_MODE: "see who else on the bus writes to the drive, then acknowledge: the stage is opened anew",
+    Stop.FORCE_UNHEEDED: "look for what delays frames on the bus, and what limits the drive, then acknowledge",
     Stop.SAMPLE_AHEAD: "check interferometer.rate_hz and the host's clock, then acknowledge",
 }
 

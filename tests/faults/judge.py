@@ -12,7 +12,8 @@ plan may reach in it, or those forces may change by.
 A macro without power coasts: it has the way to its end stops instead, and may nowhere be faster than the guard lets it
 be where its power went, and what magnets and cables give it on the way. A micro without power has its winding shorted:
 from where its power went on it is computed how far such a one goes beside this macro, and it may go no further. A drive
-that hears nothing is stopped by its own watch, and detection is what that takes.
+that hears nothing is stopped by its own watch, and detection is what that takes; one whose commands come late does what
+it was told before, which is judged as a motion that nothing has stopped yet.
 
 Rest is |v| < 1 mm/s, also for an axis that loses its power: one that is let go of faster has not come to rest, and
 its way goes on counting. From rest on a drive holds on its encoder. Its loop needs 0.2 s until it stands; that way is
@@ -149,6 +150,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
     t_ns, velocity, position = seen["t_ns"], seen["macro_velocity_m_per_s"], seen["macro_position_m"]
     noticed = record.noticed_t_ns(facts.fault_t_ns)
     noticed = noticed if noticed is not None and noticed < facts.judged_until_t_ns else None
+    heard = None if noticed is None else noticed + round(1e9 * drawn.told_late_s)  # by the macro's drive
     stopped = bool(facts.fault_kind) or noticed is not None
     found: list[tuple[str, str]] = []
     if not facts.struck:
@@ -165,9 +167,9 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         found += [(STANDSTILL, text) for text in _enabled_again(seen, at, end)]
     blind_s = drawn.lasts_s if drawn.open_loop and not np.isfinite(drawn.detection_s) else 0.0
     if not facts.fault_kind:
-        found += _unstopped(facts, record, of, blind_s)
-    elif noticed is not None and not np.isfinite(drawn.detection_s):
-        found += [(TRAVEL, text) for text in astray(facts, record.columns, noticed, of, blind_s)]
+        found += _unstopped(drawn, facts, record, of, blind_s)
+    elif heard is not None and not np.isfinite(drawn.detection_s):
+        found += [(TRAVEL, text) for text in astray(facts, record.columns, heard, of, blind_s)]
     if drawn.silent and facts.phase == "jogging":
         way_m, silent_m = silent_way_m(facts, facts.fault_t_ns, end, of)
         if not way_m <= silent_m:
@@ -176,11 +178,11 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         found += [(STANDSTILL, text) for text in moved_at_rest(seen, from_t_ns, until_t_ns)]
     counts_from, detection_s = facts.fault_t_ns, drawn.detection_s
     if not np.isfinite(detection_s):
-        counts_from, detection_s = noticed or facts.fault_t_ns, CYCLE_S
+        counts_from, detection_s = heard or facts.fault_t_ns, CYCLE_S
     at = int(np.searchsorted(t_ns, counts_from))
     asked_at = int(np.searchsorted(t_ns, _asked_until_t_ns(drawn, facts, counts_from, noticed)))
     dark = MACRO in drawn.without_power
-    if facts.fault_kind and not _had_power(seen, facts.fault_t_ns if dark else counts_from, noticed, end):
+    if facts.fault_kind and not _had_power(seen, facts.fault_t_ns if dark else counts_from, heard, end):
         found += [(STANDSTILL, text) for text in _enabled_again(seen, asked_at, end)]
         found += _let_go(seen, int(np.searchsorted(t_ns, facts.fault_t_ns)), at)
     elif facts.fault_kind:
@@ -191,11 +193,11 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
         free = min(int(np.searchsorted(t_ns, facts.fault_t_ns + round(1e9 * drawn.lasts_s))), end)
         struck_m = 0.0
         if drawn.swings:
-            stands = min(max(stands, free + SETTLED_SAMPLES), end)
+            stands = min(max(stands, free + SETTLED_SAMPLES), _power_ends(seen, rest, end))
             relative = seen["end_velocity_m_per_s"][at:stands] - velocity[at:stands]
             struck_m = of.struck_m(float(np.abs(relative).max(initial=0.0)))
         if drawn.obstacle_m is not None:
-            stands = min(max(stands, free + RELEASED_SAMPLES), end)
+            stands = min(max(stands, free + RELEASED_SAMPLES), _power_ends(seen, rest, end))
             away_m = (position[at:stands] - position[at]) * _goes_to(facts, at, drawn.obstacle_m)
             pushed_m = abs(float(position[stands - 1] - position[free]))
             back_m = OVERSHOOT * pushed_m + max(0.0, of.drive_gives_m - pushed_m)
@@ -209,7 +211,7 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             bound_m = back_m + _bound_m(t_ns, velocity, at, detection_s + facts.late_s, of, drawn.open_loop)
         if MICRO in drawn.without_power:
             gone = np.flatnonzero(~np.isin(seen["states"][at:stands, 1], _POWERED))
-            found += _too_far(seen, at + int(gone[0]), stands, of) if gone.size else []
+            found += _too_far(seen, at + (int(gone[0]) if gone.size else 0), stands, of)
         if not travel_m <= bound_m + struck_m + STANDSTILL_M:
             found.append((TRAVEL, f"macro went {travel_m * 1e3:.3f} mm, bound {bound_m * 1e3:.3f} mm"))
         if rest is None and not dark:
@@ -222,8 +224,8 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
                 found.append((STANDSTILL, f"macro moved {settled_m * 1e6:.0f} um while it settled"))
         if held_m > STANDSTILL_M + shifted_m:
             found.append((STANDSTILL, f"macro moved {held_m * 1e6:.0f} um after standstill, with power"))
-        if noticed is not None and not dark:
-            heard = noticed if MACRO not in drawn.deaf else max(noticed, facts.fault_t_ns + round(1e9 * SILENCE_S))
+        if heard is not None and not dark:
+            heard = heard if MACRO not in drawn.deaf else max(heard, facts.fault_t_ns + round(1e9 * SILENCE_S))
             begun = _begun_cycles(facts, record, heard)
             if not begun <= BEGUN_CYCLES:
                 found.append((BEGUN, f"stop begun {begun:.0f} cycles after detection"))
@@ -250,9 +252,10 @@ def _drive_homes(drawn: Drawn, facts: Facts) -> bool:
     return not (facts.seen["states"][at : end + 1, 1] == ENABLED).any()
 
 
-def _unstopped(facts: Facts, record: Record, of: Mechanics, blind_s: float) -> list[tuple[str, str]]:
+def _unstopped(drawn: Drawn, facts: Facts, record: Record, of: Mechanics, blind_s: float) -> list[tuple[str, str]]:
     """Judge a run in which nothing stopped the motion but its own end, or the operator."""
-    found = [(STANDSTILL, text) for text in not_at_rest(facts)]
+    holds_m = of.error_limit_m if drawn.swings else STANDSTILL_M
+    found = [(STANDSTILL, text) for text in not_at_rest(facts, holds_m)]
     found += [(TRAVEL, text) for text in astray(facts, record.columns, facts.judged_until_t_ns, of, blind_s)]
     found += [(TRAVEL, text) for text in not_ended(facts, record.columns, of)]
     if facts.stop_asked_t_ns:
@@ -378,10 +381,15 @@ def _enabled_again(seen: dict[str, Any], at: int, end: int) -> list[str]:
 
 def _stands(seen: dict[str, Any], rest: int | None, end: int) -> int:
     """Return the sample from which on the macro must not move: its drive's loop has settled, or its power is gone."""
+    return end if rest is None else min(rest + SETTLED_SAMPLES, _power_ends(seen, rest, end))
+
+
+def _power_ends(seen: dict[str, Any], rest: int | None, end: int) -> int:
+    """Return the sample behind the macro's rest at which its power is gone: from there on it may roll."""
     if rest is None:
         return end
     off = np.flatnonzero(~np.isin(seen["states"][rest:end, 0], _POWERED))
-    return min(rest + SETTLED_SAMPLES, rest + int(off[0]) + 1 if off.size else end, end)
+    return min(rest + int(off[0]) + 1, end) if off.size else end
 
 
 def _moved_after(seen: dict[str, Any], stands: int, end: int) -> tuple[float, float]:

@@ -51,6 +51,7 @@ class Drawn:
     lasts_s: float = 0.0
     without_power: tuple[int, ...] = ()  # nodes that can't brake
     deaf: tuple[int, ...] = ()  # nodes that hear no command: their own watch stops them
+    told_late_s: float = 0.0  # by which what the macro's drive is told comes late: its stop, too
     open_loop: bool = False  # the drive keeps its last force until the fault is noticed
     silent: bool = False  # the operator says nothing more: a jog ends by its own hold, before the lease does
     encoder_m: float = 0.0  # by which the drive's own encoder is off for a while: it holds on that
@@ -101,7 +102,8 @@ def frames_late(rng: np.random.Generator, phase: str) -> Drawn:
     can_id, delay_s, duration_s = one_of(rng, CYCLIC), between(rng, 3e-4, 8e-3), between(rng, 0.01, 0.3)
     fault = Fault("delay_frame", can_id=can_id, delay_s=delay_s, duration_s=duration_s)
     text = f"frame 0x{can_id:03X} late by {delay_s * 1e3:.1f} ms for {duration_s * 1e3:.0f} ms"
-    return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s)
+    told_late_s = delay_s if can_id == MACRO_RPDO else 0.0
+    return Drawn(text, (fault,), must_stop=False, lasts_s=duration_s, told_late_s=told_late_s)
 
 
 def frames_reordered(rng: np.random.Generator, phase: str) -> Drawn:

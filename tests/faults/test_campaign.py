@@ -152,6 +152,19 @@ def test_judges_see_a_stop_that_is_too_late_or_too_gentle():
     assert bars_missed(*rest_after(2.0, noticed_s=0.06)) == {TRAVEL}
 
 
+@pytest.mark.parametrize(("told_late_s", "missed"), [(5e-3, set()), (0.0, {TRAVEL, BEGUN})])
+def test_a_drive_whose_commands_come_late_stops_when_it_is_told(told_late_s, missed):
+    """Until then it may do what it was told before, and nothing else."""
+    facts, record = rest_after(2.0, noticed_s=0.025)
+    told = facts.seen["t_ns"] >= 1_020_000_000
+    record.columns |= {"run_phase": np.where(told, 6, 4), "stop": np.where(told, 29, 0)}
+    late = Drawn("frames late", lasts_s=0.1, told_late_s=told_late_s)
+    facts.planned_m_per_s = 0.4
+    assert bars_missed(facts, record, late) == missed
+    facts.seen["macro_velocity_m_per_s"][1022] = 0.45
+    assert bars_missed(facts, record, late) == missed | {TRAVEL}
+
+
 def test_judges_see_a_drive_that_goes_on_after_detection():
     facts, record = rest_after(2.0)
     facts.seen["states"][1000:1040] = ENABLED
@@ -346,11 +359,13 @@ def test_a_deaf_drive_has_until_its_own_watch_and_no_longer():
         assert bars_missed(facts, record, replace(fault, deaf=(MACRO,))) == missed
 
 
-def test_a_drift_without_power_is_measured_and_no_command():
+@pytest.mark.parametrize("more", [{}, {"swings": True}, {"obstacle_m": 20e-3}], ids=["", "swings", "obstacle"])
+def test_a_drift_without_power_is_measured_and_no_command(more):
+    """Also where the fault is not over before the power is."""
     facts, record = rest_after(2.0)
     facts.seen["states"][1500:] = 1
     facts.seen["macro_position_m"][1600:] += 30e-6
-    verdict = judge(FAULT, facts, record)
+    verdict = judge(replace(FAULT, lasts_s=0.8, **more), facts, record)
     assert verdict.violations == ()
     assert verdict.drift_m == pytest.approx(30e-6)
 
@@ -419,6 +434,13 @@ def test_a_stage_that_holds_is_seen_to_move_without_a_fault_too():
         facts.seen[name][1200:] += 0.1
     facts.seen["macro_velocity_m_per_s"][1150:1200] = 2.0
     assert bars_missed(facts, record, GOES_BY) == {STANDSTILL, TRAVEL}
+
+
+@pytest.mark.parametrize(("moved_m", "missed"), [(190e-6, set()), (210e-6, {STANDSTILL})])
+def test_an_end_that_its_motor_cannot_hold_moves_its_macro_by_the_error_limit_at_most(moved_m, missed):
+    facts, record = unstopped("at rest")
+    facts.seen["macro_position_m"][1200:1500] += moved_m
+    assert bars_missed(facts, record, replace(GOES_BY, swings=True)) == missed
 
 
 @pytest.mark.parametrize("phase", ["constant speed", "jogging", "identifying"])

@@ -73,7 +73,8 @@ def test_without_its_word_the_same_is_noticed_by_what_it_does(tmp_path, oled_pro
     with one:
         silent = Fault("drop_frame", can_id=MACRO_INPUTS, duration_s=10.0)
         _, truth = held_and_struck(one, silent, *sent_to_a_stale_target(one, oled_profile.macro.encoder_step_m))
-        assert one.stage.status()["stop"] in (Stop.MICRO_STROKE, Stop.FOLLOWING_ERROR, Stop.VELOCITY)
+        assert one.stage.status()["stop"] == Stop.FORCE_UNHEEDED
+        assert one.stage.detail.startswith("macro (node 1) reports ")
     assert np.abs(truth["macro_velocity_m_per_s"]).max() > 0.02
 
 

@@ -104,8 +104,11 @@ def moved_at_rest(seen: dict[str, Any], from_t_ns: int, until_t_ns: int) -> list
     return found
 
 
-def not_at_rest(facts: Facts) -> list[str]:
-    """Return how a stage moved that holds, or has come to rest with power."""
+def not_at_rest(facts: Facts, holds_m: float) -> list[str]:
+    """Return how a stage moved that holds, or has come to rest with power.
+
+    `holds_m`: how far its macro may; that of an end which its own motor can't hold goes with it, as far as that may.
+    """
     seen = facts.seen
     at, end = (int(np.searchsorted(seen["t_ns"], t_ns)) for t_ns in (facts.fault_t_ns, facts.judged_until_t_ns))
     position, powered = seen["macro_position_m"][at:end], seen["states"][at:end, 0] == ENABLED
@@ -113,7 +116,7 @@ def not_at_rest(facts: Facts) -> list[str]:
     if facts.phase in ("at rest", "arming") and powered.any():
         first = int(np.flatnonzero(powered)[0])
         moved_m = float(np.abs(position[first:][powered[first:]] - position[first]).max())
-        limit_m = STANDSTILL_M if facts.phase == "at rest" else SETTLING_M
+        limit_m = holds_m if facts.phase == "at rest" else SETTLING_M
         if not moved_m <= limit_m:
             found.append(f"macro moved {moved_m * 1e6:.0f} um while it held")
     speed = abs(float(seen["macro_velocity_m_per_s"][end - 1]))
