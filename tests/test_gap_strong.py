@@ -9,7 +9,6 @@ import pytest
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses, seeds
-from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Serial
 from stagectl.gap.curvature import at_best_shapes
@@ -21,35 +20,9 @@ from stagectl.gap.normal_equations import Group, solve
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner, power_of_size
 from stagectl.gap.settling import _resized
+from tests.driven_axis import AXIS, MASS, NOISE_M, STEPS, H, axis_under
 
-H, STEPS, MASS, NOISE_M = 1e-3, 10, 40.0, 5e-9
-DURATION_S = 8.0
 PITCH_M, RIPPLE = 15.4e-3, 0.03
-
-AXIS = Believed("an axis", H, BelievedAxis(MASS, 0.2, NOISE_M, 0.0, force_constant_sd_ratio=0.005, latch_sd_s=5e-6))
-
-
-def _axis_under(made_n: Callable[[float, float, float], float], seed: int) -> Log:
-    """Run an axis in closed loop, its motor's force made by `made_n` of command, position and velocity."""
-    random = np.random.default_rng(seed)
-    count = round(DURATION_S / H)
-    t = np.arange(count) * H
-    stroke_m, hz, phase = 0.03 + 0.01 * seed, 0.6 + 0.1 * seed, 0.4 * seed
-    turn = 2.0 * np.pi * hz
-    goal = stroke_m * np.sin(turn * t + phase) + 0.01 * np.sin(2.6 * turn * t)
-    rate, pull = np.gradient(goal, H), np.gradient(np.gradient(goal, H), H)
-    noise = NOISE_M * random.standard_normal(count)
-    x, v = float(goal[0]), float(rate[0])
-    seen, command = np.zeros(count), np.zeros(count)
-    h = H / STEPS
-    for k in range(count):
-        seen[k] = x + noise[k]
-        command[k] = MASS * (pull[k] + 900.0 * (goal[k] - seen[k]) + 42.0 * (rate[k] - v))
-        for _ in range(STEPS):
-            x += 0.5 * h * v
-            v += h * made_n(command[k], x, v) / MASS
-            x += 0.5 * h * v
-    return Log(f"run {seed}", H, seen, command, np.ones(count, bool), "one")
 
 
 def _rippled_n(command_n: float, x: float, v: float) -> float:
@@ -58,7 +31,7 @@ def _rippled_n(command_n: float, x: float, v: float) -> float:
 
 @functools.cache
 def _recordings() -> tuple[Recording, ...]:
-    return tuple(balance.recording_of(_axis_under(_rippled_n, seed), AXIS) for seed in (1, 2))
+    return tuple(balance.recording_of(axis_under(_rippled_n, seed), AXIS) for seed in (1, 2))
 
 
 def _signals(recordings: Sequence[Recording]) -> list[np.ndarray]:
@@ -88,7 +61,7 @@ def test_a_pitch_of_few_periods_stands_out_of_noise_where_it_does_not_of_its_nei
     pitch_m = 60e-3
     recordings = [
         balance.recording_of(
-            _axis_under(lambda n, x, v: n * (1.0 + RIPPLE * np.sin(2.0 * np.pi * x / pitch_m + 0.7)), seed), AXIS
+            axis_under(lambda n, x, v: n * (1.0 + RIPPLE * np.sin(2.0 * np.pi * x / pitch_m + 0.7)), seed), AXIS
         )
         for seed in (1, 2)
     ]
@@ -128,7 +101,7 @@ def test_a_strong_effect_is_searched_until_nothing_is_left_and_does_not_raise_th
 def test_a_drag_is_named_beside_a_ripple_of_ten_thousand_times_its_squares():
     """A ripple along a motion that is measured is exact: what a friction, or bristles, would leave it does not."""
     recordings = [
-        balance.recording_of(_axis_under(lambda n, x, v: _rippled_n(n, x, v) - 2.5 * v * abs(v), seed), AXIS)
+        balance.recording_of(axis_under(lambda n, x, v: _rippled_n(n, x, v) - 2.5 * v * abs(v), seed), AXIS)
         for seed in (1, 2, 3)
     ]
     noise = slow_noise(AXIS, recordings[0])
@@ -151,7 +124,7 @@ def test_the_pitch_of_a_force_that_is_no_sine_is_searched_as_well():
         angle = 2.0 * np.pi * x / PITCH_M
         return command_n + 0.3 * np.sin(angle + 0.7) + 0.09 * np.sin(2.0 * angle - 1.1)
 
-    recordings = [balance.recording_of(_axis_under(cogged_n, seed), AXIS) for seed in (1, 2)]
+    recordings = [balance.recording_of(axis_under(cogged_n, seed), AXIS) for seed in (1, 2)]
     for recording in recordings:
         balance.set_noise(recording, slow_noise(AXIS, recording))
     evidence = Evidence(recordings)
@@ -178,7 +151,7 @@ def _swinging(share: float, frequency_hz: float, damping: float) -> Callable[[fl
 
 def test_a_mass_that_swings_is_all_that_a_motion_leaves_that_knows_nothing_of_it():
     """At its own size. Driven by the acceleration that a filter foretold, part of the ringing drove it as well."""
-    recordings = [balance.recording_of(_axis_under(_swinging(0.12, 17.5, 0.04), seed), AXIS) for seed in (1, 2)]
+    recordings = [balance.recording_of(axis_under(_swinging(0.12, 17.5, 0.04), seed), AXIS) for seed in (1, 2)]
     for recording in recordings:
         balance.set_noise(recording, slow_noise(AXIS, recording))
     evidence = Evidence(recordings)
@@ -201,7 +174,7 @@ def test_a_mass_that_swings_is_all_that_a_motion_leaves_that_knows_nothing_of_it
 
 def test_a_search_of_shapes_that_depend_on_each_other_ends_where_they_are():
     """From there a search line by line stays at 4 %: share, frequency and damping pull along a narrow valley."""
-    recordings = [balance.recording_of(_axis_under(_swinging(0.15, 18.8, 0.033), seed), AXIS) for seed in (1, 2)]
+    recordings = [balance.recording_of(axis_under(_swinging(0.15, 18.8, 0.033), seed), AXIS) for seed in (1, 2)]
     for recording in recordings:
         balance.set_noise(recording, slow_noise(AXIS, recording))
     evidence = Evidence(recordings)
@@ -221,7 +194,7 @@ def test_bristles_are_searched_with_their_damping():
         law = CATALOGUE["lugre_friction"].law
         return lambda command_n, x, v: command_n + law(v, H / STEPS, 2.0, *true.values(), memory)
 
-    recordings = [balance.recording_of(_axis_under(rubbed_by(np.zeros(1)), seed), AXIS) for seed in (1, 2)]
+    recordings = [balance.recording_of(axis_under(rubbed_by(np.zeros(1)), seed), AXIS) for seed in (1, 2)]
     for recording in recordings:
         balance.set_noise(recording, slow_noise(AXIS, recording))
     evidence = Evidence(recordings)
@@ -241,7 +214,7 @@ def test_iron_that_saturates_is_found_from_any_place_of_the_grid(seed_n):
     def saturating_n(command_n: float, x: float, v: float) -> float:
         return command_n + CATALOGUE["force_constant_saturation"].law(command_n, 200.0)
 
-    recordings = [balance.recording_of(_axis_under(saturating_n, seed), AXIS) for seed in (1, 2)]
+    recordings = [balance.recording_of(axis_under(saturating_n, seed), AXIS) for seed in (1, 2)]
     for recording in recordings:
         balance.set_noise(recording, slow_noise(AXIS, recording))
     evidence = Evidence(recordings)
@@ -285,7 +258,7 @@ def _ringing() -> Callable[[float, float, float], float]:
 @pytest.mark.parametrize("off", [(1.0, 1.0), (0.995, 1.1)])
 def test_a_share_of_the_mass_is_as_uncertain_as_its_frequency_and_damping_make_it(off: tuple[float, float]):
     """At given shapes its deviation is less than half as large; and a frequency that is 0.5 % off is brought back."""
-    recordings = [balance.recording_of(_axis_under(_ringing(), seed), AXIS) for seed in (1, 2)]
+    recordings = [balance.recording_of(axis_under(_ringing(), seed), AXIS) for seed in (1, 2)]
     shape = {"share_ratio": off[1] * SHARE, "frequency_hz": off[0] * MODE_HZ, "damping_ratio": off[1] * MODE_DAMPING}
     term = hypotheses.term_at_size(CATALOGUE["flexible_mode"], "macro_force", shape)
     search = Competition(recordings, 2, noise=slow_noise(AXIS, recordings[0]), kept=[term])
@@ -307,7 +280,7 @@ def test_a_law_that_is_not_exact_is_as_uncertain_as_stretches_differ(uneven: flo
     def rubbed_n(command_n: float, x: float, v: float) -> float:
         return command_n - true * v * (1.0 + uneven * np.sign(x))
 
-    recordings = [balance.recording_of(_axis_under(rubbed_n, seed), AXIS) for seed in (1, 2)]
+    recordings = [balance.recording_of(axis_under(rubbed_n, seed), AXIS) for seed in (1, 2)]
     term = hypotheses.term_of(CATALOGUE["viscous_friction"], "macro_force", {})
     search = Competition(recordings, 2, noise=slow_noise(AXIS, recordings[0]), kept=[term])
     chosen, solution = at_best_shapes(search, search.kept)
@@ -332,7 +305,7 @@ def _late(delay_s: float) -> Callable[[float, float, float], float]:
 def test_known_parameters_make_up_for_nothing_that_is_part_of_the_operating_point():
     """Solved without a delay of 0.6 ms they did: half a newton of force noise, and four false names, beside it."""
     delay_s = 0.6e-3
-    recordings = [balance.recording_of(_axis_under(_late(delay_s), seed), AXIS) for seed in (1, 2)]
+    recordings = [balance.recording_of(axis_under(_late(delay_s), seed), AXIS) for seed in (1, 2)]
     term = hypotheses.term_at_size(CATALOGUE["command_delay"], "macro_command", {"delay_s": delay_s})
     search = Competition(recordings, 2, noise=slow_noise(AXIS, recordings[0]), kept=[term])
     motion = moved_under(search.kept, (), search, recordings, Serial())

@@ -31,6 +31,7 @@ that is 1e-4 off leaves a thousand."""
 _BRACKET = 2.2  # from the grid's place, up and down
 _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one turn over the travel
 _ANCHOR_M = 1.0
+_MOVED_PLACE_M = 0.1
 _NEAR_ZERO = 0.05
 LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)
@@ -107,6 +108,8 @@ class Refiner:
                 return None
             term = at_size
             free = tuple(dict.fromkeys((*CATALOGUE[term.name].parameters[:1], *free)))
+        if Trait.PLACED in CATALOGUE[term.name].traits:
+            return self._at_its_place(term), len(free)
         shape = dict(term.shape)
         best = self._gain(term)
         for sweep in range(_MOST_SWEEPS):
@@ -126,6 +129,22 @@ class Refiner:
             least = stated_s / found.shape[CATALOGUE[found.name].parameters[0]]
             found = replace(found, bounds=((max(found.bounds[0][0], least), found.bounds[0][1]),))
         return found, len(free) - (0 if found.linear else 1)
+
+    def _at_its_place(self, term: Term) -> Term:
+        """Return a law that acts about a place at the place that is asked for: size, and size times place, are factors.
+
+        Searched line by line from the middle of the travel, a cable whose anchor lay beside it was never a rival: there
+        its pull gains less than the offset that it mostly is.
+        """
+        (name,) = free_shapes(CATALOGUE[term.name])
+        low, high = CATALOGUE[term.name].bounds[name]
+        here = self._evidence.columns_of(term)
+        moved = self._evidence.columns_of(with_shape(term, {name: term.shape[name] + _MOVED_PLACE_M}))
+        both = _side_by_side([here, _difference(moved, here)])
+        size, shift = self._amplitudes(both, replace(term, amplitudes=(*term.amplitudes, name)))
+        if not abs(size) > 0.0:
+            return term
+        return with_shape(term, {name: float(np.clip(term.shape[name] + _MOVED_PLACE_M * shift / size, low, high))})
 
     def gain_at_size(self, term: Term) -> float:
         """Return what a hypothesis gains at the best of a few sizes, where its column is of no use: in contact."""

@@ -7,6 +7,7 @@ Pure.
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -103,6 +104,14 @@ def _fitted(
     return base, solve(base, evidence.sums), evidence
 
 
+class Left(NamedTuple):
+    """What a model leaves above the noise, in squares of it, of how many samples, and that noise."""
+
+    squares: float
+    count: int
+    scales: Scales
+
+
 def left_at_size(
     recordings: Sequence[Recording],
     noise: dict[str, Noise],
@@ -110,15 +119,16 @@ def left_at_size(
     beside: Sequence[Term],
     crew: Crew,
     scales: Scales | None = None,
-) -> tuple[float, Scales]:
-    """Return what is left above the noise where all of `moved` is where the recordings have it, and the noise.
+) -> Left:
+    """Return what is left above the noise where all of `moved` is where the recordings have it.
 
     scales: the noise of another that this is compared with. Each beside its own, two that nobody can tell apart were
     14 squares apart: of 80 000 samples, a noise that came out 1e-4 smaller.
     """
     there, moved, beside = settled(recordings, noise, moved, beside, crew)
     _, solution, evidence = _fitted(there, noise, moved, beside, crew, scales)
-    return sum(float(s.gram[0, 0]) - s.count for s in evidence.sums) - solution.gain, evidence.scales
+    squares = sum(float(s.gram[0, 0]) - s.count for s in evidence.sums) - solution.gain
+    return Left(squares, round(sum(s.count for s in evidence.sums)), evidence.scales)
 
 
 def belief_under(first: Competition, search: Competition, crew: Crew) -> Judge:

@@ -1,0 +1,97 @@
+"""Laws that are nearly alike: the simpler one where recordings can't tell them apart, and no simpler one where they can."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from stagectl.gap import balance
+from stagectl.gap.competition import Competition
+from stagectl.gap.noise import slow_noise
+from stagectl.gap.normal_equations import Group
+from stagectl.gap.selection import ALIAS_SHARE, EXACT_RATIO
+from tests.driven_axis import AXIS, STEPS, H, axis_under
+
+Made = Callable[[float, float, float], float]
+
+
+def _search(made_n: Callable[[], Made]) -> Competition:
+    """Let all hypotheses get ready on two runs; `made_n` makes the motor's force anew for each."""
+    recordings = [balance.recording_of(axis_under(made_n(), seed), AXIS) for seed in (1, 2)]
+    search = Competition(recordings, 2, nulls_count=20, noise=slow_noise(AXIS, recordings[0]))
+    search.judge.calibrate()
+    return search
+
+
+def _of_library(search: Competition, name: str) -> Group:
+    return next(group for group in search.judge.library if group.key == (name, "macro_force"))
+
+
+def _pulled_by(stiffness_n_per_m: float, anchor_m: float) -> Callable[[], Made]:
+    return lambda: lambda command_n, x, v: command_n - stiffness_n_per_m * (x - anchor_m)
+
+
+def _bristled(static_ratio: float, damping_s: float) -> Callable[[], Made]:
+    """Bristles of 2 N that slip by 17 um, and what they hold at rest more than in motion, below 1.5 mm/s."""
+
+    def make() -> Made:
+        bent = np.zeros(1)  # of the slip
+
+        def made_n(command_n: float, x: float, v: float) -> float:
+            most = 1.0 + (static_ratio - 1.0) * np.exp(-((v / 1.5e-3) ** 2))
+            rate = (v - abs(v) * bent[0] / most) / 17e-6
+            bent[0] = np.clip(bent[0] + rate * H / STEPS, -most, most)
+            return command_n - 2.0 * (bent[0] + damping_s * rate)
+
+        return made_n
+
+    return make
+
+
+@pytest.mark.parametrize("anchor_m", [0.02, 0.25, -3.0])
+def test_a_cable_is_found_wherever_its_anchor_is(anchor_m):
+    """From the middle of the travel alone, one whose anchor lay beside it was the offset that it mostly is."""
+    search = _search(_pulled_by(60.0, anchor_m))
+    (found,) = search.judge.select()
+    term = search.term(found)
+    assert term.name == "cable_spring"
+    assert term.shape["anchor_m"] == pytest.approx(anchor_m, rel=0.02)
+
+
+def test_an_offset_and_a_spring_are_one_cable():
+    """As they start from a look before: beside either of them a cable says what the other says, with a number more."""
+    search = _search(_pulled_by(60.0, 0.25))
+    start = [_of_library(search, "offset"), _of_library(search, "linear_stiffness")]
+    assert [group.key[0] for group in search.judge.select(start)] == ["cable_spring"]
+
+
+def test_a_spring_about_zero_is_no_cable():
+    """A cable gains what noise does more: by that, and 0.002 % of what both gain, they are the same."""
+    search = _search(_pulled_by(60.0, 0.0))
+    assert [group.key[0] for group in search.judge.select()] == ["linear_stiffness"]
+
+
+@pytest.mark.parametrize(
+    ("static_ratio", "damping_s", "name"), [(1.0, 0.0, "dahl_friction"), (1.1, 3e-4, "lugre_friction")]
+)
+def test_what_leaves_no_curve_is_told_from_a_simpler_law_by_less_than_inexact_laws_are(static_ratio, damping_s, name):
+    """A rise of a tenth is 0.1 % of what the bristles gain: of Dahl's own, LuGre's gain no more than noise does."""
+    search = _search(_bristled(static_ratio, damping_s))
+    judge = search.judge
+    (found,) = judge.select()
+    assert found.key[0] == name
+    rivals = {group.key[0]: judge.gain([group]) - judge.gain([]) for group in judge.rivals([])}
+    share = 1.0 - rivals["dahl_friction"] / rivals["lugre_friction"]
+    assert share < 0.2 * EXACT_RATIO if name == "dahl_friction" else EXACT_RATIO < share < ALIAS_SHARE
+
+
+def test_a_level_and_a_rise_between_two_speeds_of_the_grid_are_no_bristles():
+    """Bristles that slip by nothing are both at once; of pairs as the grid has them two steps gained more."""
+
+    def rubbed_n(command_n: float, x: float, v: float) -> float:
+        return command_n - 2.0 * (1.0 + 0.6 * np.exp(-((v / 5.5e-3) ** 2))) * np.sign(v)
+
+    search = _search(lambda: rubbed_n)
+    found = {group.key[0]: search.term(group).shape for group in search.judge.select()}
+    assert found.keys() == {"coulomb_friction", "stribeck_friction"}
+    assert found["stribeck_friction"]["stribeck_m_per_s"] == pytest.approx(5.5e-3, rel=0.02)
