@@ -1,4 +1,4 @@
-"""Laws that are nearly alike: the simpler one where recordings can't tell them apart, and no simpler one where they can."""
+"""Laws that are nearly alike: the simpler one where recordings can't tell them apart, and only there."""
 
 from collections.abc import Callable
 

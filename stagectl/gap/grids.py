@@ -21,9 +21,9 @@ _SLIPS_M = (1e-6, 5e-6, 2e-5, 1e-4)
 1.6, and ended at 37."""
 
 _ANCHORS = (0.0, 0.5, -0.5, 1.5, -1.5, 5.0, -5.0)
-"""Of half the travel from its middle. Between two of them a cable loses 6 % of its gain at most: 15 degrees in the plane of
-pull at rest and stiffness. From the middle alone one that was anchored beside the travel did not rank: 32 000 squares of
-115 000, and the offset that it mostly is 105 000."""
+"""Of half the travel from its middle. Between two of them a cable loses 6 % of its gain at most: 15 degrees in the
+plane of pull at rest and stiffness. From the middle alone one that was anchored beside the travel did not rank: 32 000
+squares of 115 000, and the offset that it mostly is 105 000."""
 
 _LASER_M = 632.8e-9
 

@@ -137,10 +137,8 @@ def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Loo
             continue
         rest = [*chosen[:k], *chosen[k + 1 :]]
         least = search.judge.gain(chosen) - ALIAS_GAIN
-        forms = [group]
-        for other in search.judge.rivals(rest):
-            if _is_other_form(search, group, other) and search.judge.gain([*rest, other]) > least:
-                forms.append(other)
+        others = [other for other in search.judge.rivals(rest) if _is_other_form(search, group, other)]
+        forms = [group, *(other for other in others if search.judge.gain([*rest, other]) > least)]
         left = _left_under(search, [[*rest, form] for form in forms], unsettled, crew) if len(forms) > 1 else []
         best = _least(left)
         gone = {

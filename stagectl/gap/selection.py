@@ -425,22 +425,6 @@ class Judge:
             if group.complexity < best.complexity
             and gains[id(best)] - gains[id(group)] < ALIAS_GAIN + shares(best, group) * gains[id(best)]
         ]
-        if __import__("os").environ.get("SEE"):
-            print(
-                "simplest",
-                best.key,
-                gains[id(best)],
-                [
-                    (
-                        g.key,
-                        round(gains[id(best)] - gains[id(g)], 1),
-                        round((gains[id(best)] - gains[id(g)]) / gains[id(best)], 6),
-                        shares(best, g),
-                        g in near,
-                    )
-                    for g in candidates
-                ],
-            )
         return max(near, key=lambda group: gains[id(group)] - self.price() * group.complexity, default=best)
 
     def _allowed(self, groups: Sequence[Group]) -> bool:
