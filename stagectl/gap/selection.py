@@ -626,12 +626,13 @@ class Judge:
         return alike
 
     def _alike(self, chosen: Sequence[Group], group: Group) -> float:
-        """Return by how much less than one of `chosen` gains what is simpler may gain and still be as good.
+        """Return by how much less than bristles, one of `chosen`, a level and a rise may gain and still be as good.
 
-        Bristles that slip by 12 nm gained 47 squares of 2.5 million more than the level and rise that they were.
+        As laws they are as exact as smooth ones, up to the speed over which a sign turns, which the grid has: bristles
+        that slip by 12 nm gained 47 squares of 2.5 million more than the level and rise that they were.
         """
         gained = self.gain(chosen) - self.gain([other for other in chosen if other is not group])
-        return self._alike_beside(chosen)(group, group, gained)
+        return ALIAS_GAIN + SMOOTH_RATIO * gained
 
     def _is_inexact(self, group: Group, other: Group, share: float, lies_between: bool) -> bool:
         """Tell whether the share of a gain that two laws differ by may come from laws that are inexact."""
