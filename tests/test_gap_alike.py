@@ -5,11 +5,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from stagectl.gap import balance
+from stagectl.gap import balance, looks
 from stagectl.gap.competition import Competition
+from stagectl.gap.crew import Serial
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group
-from stagectl.gap.selection import ALIAS_SHARE, EXACT_RATIO, LEFT_SDS
+from stagectl.gap.selection import ALIAS_SHARE, EXACT_RATIO, LEFT_SDS, Judge
+from stagectl.gap.settling import Left
 from tests.driven_axis import AXIS, STEPS, H, axis_under
 
 Made = Callable[[float, float, float], float]
@@ -117,3 +119,24 @@ def test_a_level_and_a_rise_between_two_speeds_of_the_grid_are_no_bristles():
     found = {group.key[0]: search.term(group).shape for group in search.judge.select()}
     assert found.keys() == {"coulomb_friction", "stribeck_friction"}
     assert found["stribeck_friction"]["stribeck_m_per_s"] == pytest.approx(5.5e-3, rel=0.02)
+
+
+@pytest.mark.parametrize(("stays", "name"), [(True, "linear_stiffness"), (False, "sensor_lag")])
+def test_what_leaves_less_at_its_size_takes_a_place_where_it_would_have_stayed(stays, name, monkeypatch):
+    """A rise that a friction was inexact by took the place of a lag: 400 squares for 240, and no name by itself."""
+    search = _search(_pulled_by(60.0, 0.0))
+    stood = Judge._stays
+    monkeypatch.setattr(
+        Judge,
+        "_stays",
+        lambda judge, chosen, group: stood(judge, chosen, group) and (stays or group.key[0] == "sensor_lag"),
+    )
+    lag = next(group for group in search.judge.library if group.key == ("sensor_lag", "macro_sensor"))
+
+    def left_under(search: Competition, models: list[list[Group]], *_: object) -> list[Left]:
+        return [Left(0.0 if model[-1].key[0] == "linear_stiffness" else 1000.0, 16_000, {}) for model in models]
+
+    monkeypatch.setattr(looks, "_left_under", left_under)
+    monkeypatch.setattr(looks, "all_named", lambda *_: ())
+    look = looks._told_at_size(looks.Look(search, [lag], ()), [], Serial())
+    assert [group.key[0] for group in look.chosen] == [name]

@@ -161,14 +161,15 @@ def _told_at_size(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Loo
 
     What moves readings puts the joint elsewhere, which its column says nothing of: a scale error of 0.19 % was worth 3
     squares more than the spring of 1.1 N/m that there was, and put the joint 109 um and 12 000 squares off. What was
-    chosen beside it is to be found anew.
+    chosen beside it is to be found anew. What would not have stayed in its place is none of them: a rise that a
+    sub-linear friction is inexact by gained 400 squares where a lag of the sensor gained 240.
     """
     search, judge = look.search, look.search.judge
     for k, group in enumerate(look.chosen):
         before = look.chosen[:k]
         least = judge.gain([*before, group]) - ALIAS_GAIN
         forms = [group]
-        for other in judge.rivals(before):
+        for other in judge.passing(before):
             told = moves_readings(search, group) or moves_readings(search, other)
             known = "parameter" in (group.key[1], other.key[1]) or other.key == group.key
             if told and not known and not _is_other_form(search, group, other) and judge.gain([*before, other]) > least:

@@ -232,7 +232,7 @@ class Judge:
             if self.lacks_a_name(chosen):
                 self._note(chosen, rivals)
                 break
-            passing = [group for group in rivals if self._stays(chosen, group) and self._allowed([*chosen, group])]
+            passing = self.passing(chosen)
             self._note(chosen, rivals)
             more = [self._simplest(chosen, passing)] if passing else self._pair(chosen, rivals)
             grown = [*chosen, *more] if more else self._reshaped_with_one(chosen, rivals)
@@ -376,6 +376,12 @@ class Judge:
         if state not in self._known_rivals:
             self._known_rivals[state] = self._ranked(chosen, RIVALS_COUNT)
         return self._known_rivals[state]
+
+    def passing(self, chosen: Sequence[Group]) -> list[Group]:
+        """Return the rivals that would stay beside `chosen`, at sizes that they can have."""
+        return [
+            group for group in self.rivals(chosen) if self._stays(chosen, group) and self._allowed([*chosen, group])
+        ]
 
     def reshaped(self, chosen: Sequence[Group]) -> list[Group]:
         """Return groups at the shapes that are best here: what they were along another motion need not be it."""
