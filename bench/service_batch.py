@@ -15,13 +15,15 @@ from tests.faults.judge import BACK, BARS, BEGUN_CYCLES, GENTLE, LOST, TRAVEL
 from tests.faults.kinds import KINDS
 
 RUNS = 70  # every kind twice
-FULL_RUNS = 900
+FULL_SEEDS = range(20_000, 20_900)
+"""Moved on by as many behind every mend: on seeds that code and judges were mended on 900 runs of 900 held, of fresh ones
+998 of 1000."""
 
 BEGUN = Bar("batch: stop begun after fault detection, worst run", "cycles", BEGUN_CYCLES)
 MISSED = {name: Bar(f"batch: {name}", "cycles" if name == LOST else "runs", 0.0) for name in BARS if name != BACK}
 RECOVERED = Bar("batch: armed again without a restart, where the fault is gone", "%", 100.0, True)
 COUNT = Bar("batch: runs", "runs", RUNS, True)
-COUNT_FULL = Bar("batch: runs", "runs", FULL_RUNS, True)
+COUNT_FULL = Bar("batch: runs", "runs", len(FULL_SEEDS), True)
 COUNT_ONE = Bar("batch: runs", "runs")  # of a run that is played again
 TIME = Bar("batch: time of a run, mean", "s")
 
@@ -30,7 +32,7 @@ Say = Callable[[str], None]
 
 def figures(*, full: bool, say: Say, seeds: Sequence[int] | None = None) -> Iterator[Figure]:
     """Play the seeds, or go on with what the journal has not; then judge them together."""
-    wanted = list(seeds) if seeds is not None else list(range(FULL_RUNS if full else RUNS))
+    wanted = list(seeds) if seeds is not None else list(FULL_SEEDS if full else range(RUNS))
     journal = Journal(beside_figures("service-batch") if full and seeds is None else None)
     missing = [seed for seed in wanted if seed not in journal.entries]
     with tempfile.TemporaryDirectory(prefix="stagectl-faults-") as folder:
