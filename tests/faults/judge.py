@@ -7,7 +7,7 @@ The macro may go, from the fault on,
 with v and a true at that instant and t the detection time and one cycle, with real processes also what the host held
 servo or rig up. Until the fault is noticed the planned motion goes on, or the drive keeps the force that balanced
 magnets and cables at one place: a is the greatest gain of speed that was truly seen within t, and never more than a
-plan may reach in it, or those forces may change by.
+plan may reach in it, or those forces may change by; those of a micro that loses its power change as well.
 
 A macro without power coasts: it has the way to its end stops instead, and may nowhere be faster than the guard lets it
 be where its power went, and what magnets and cables give it on the way. A micro without power has its winding shorted:
@@ -208,7 +208,9 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
             bound_m = _way_to_stops_m(velocity, position, at, stands, of)
             found += _too_fast(seen, at, stands, of)
         else:
-            bound_m = back_m + _bound_m(t_ns, velocity, at, detection_s + facts.late_s, of, drawn.open_loop)
+            limp = MICRO in drawn.without_power
+            t_s = detection_s + facts.late_s
+            bound_m = back_m + _bound_m(t_ns, velocity, at, t_s, of, drawn.open_loop, limp)
         if MICRO in drawn.without_power:
             gone = np.flatnonzero(~np.isin(seen["states"][at:stands, 1], _POWERED))
             found += _too_far(seen, at + (int(gone[0]) if gone.size else 0), stands, of)
@@ -276,9 +278,15 @@ def _unstopped(drawn: Drawn, facts: Facts, record: Record, of: Mechanics, blind_
 
 
 def _bound_m(
-    t_ns: np.ndarray, velocity: np.ndarray, at: int, detection_s: float, of: Mechanics, open_loop: bool = False
+    t_ns: np.ndarray,
+    velocity: np.ndarray,
+    at: int,
+    detection_s: float,
+    of: Mechanics,
+    open_loop: bool = False,
+    limp: bool = False,
 ) -> float:
-    """Return how far the macro may go from sample `at` on."""
+    """Return how far the macro may go from sample `at` on; `limp`: beside a micro that has just lost its power."""
     before = max(at - SLOPE_SAMPLES, 0)
     span_s = 1e-9 * float(t_ns[at] - t_ns[before]) or CYCLE_S
     a = abs(float(velocity[at] - velocity[before])) / span_s
@@ -286,7 +294,8 @@ def _bound_m(
     until = max(int(np.searchsorted(t_ns, t_ns[at] + round(1e9 * t))), at + 1)
     speed = np.abs(velocity[before:until])
     gained = float(((speed[SLOPE_SAMPLES:] - speed[:-SLOPE_SAMPLES]) / (SLOPE_SAMPLES * CYCLE_S)).max(initial=0.0))
-    most = a + of.drift_m_per_s2 if open_loop else min(a + of.plan_m_per_s3 * t, of.plan_m_per_s2)
+    planned = min(a + of.plan_m_per_s3 * t, of.plan_m_per_s2)
+    most = a + of.drift_m_per_s2 if open_loop else planned + limp * of.drift_m_per_s2
     a = max(a, min(most, gained))
     v = abs(float(velocity[at]))
     return v * t + 0.5 * a * t * t + (v + a * t) ** 2 / (2.0 * of.ramp_m_per_s2)
