@@ -140,3 +140,24 @@ def test_what_leaves_less_at_its_size_takes_a_place_where_it_would_have_stayed(s
     monkeypatch.setattr(looks, "all_named", lambda *_: ())
     look = looks._told_at_size(looks.Look(search, [lag], ()), [], Serial())
     assert [group.key[0] for group in look.chosen] == [name]
+
+
+def test_no_name_is_dropped_where_forms_are_told_apart_beside_all_names(monkeypatch):
+    """A spring left less at its size than a wear beside which it stood, and a delay and a lag were compared without."""
+    search = _search(_pulled_by(60.0, 0.0))
+    stood = Judge._stays
+    monkeypatch.setattr(
+        Judge, "_stays", lambda judge, chosen, group: group.key[0] == "sensor_lag" or stood(judge, chosen, group)
+    )
+    lag = next(group for group in search.judge.library if group.key == ("sensor_lag", "macro_sensor"))
+    spring = _of_library(search, "linear_stiffness")
+
+    def left_under(search: Competition, models: list[list[Group]], *_: object) -> list[Left]:
+        return [Left(0.0 if model[-1].key == spring.key else 1000.0, 16_000, {}) for model in models]
+
+    monkeypatch.setattr(looks, "_left_under", left_under)
+    monkeypatch.setattr(looks, "all_named", lambda *_: ())
+    first, closer = looks.Look(search, [lag], ()), looks.Look(search, [lag, spring], ())
+    again = looks._again_in(search, first, closer, [], Serial())
+    assert again is not None
+    assert {group.key for group in again.chosen} == {lag.key, spring.key}

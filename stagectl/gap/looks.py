@@ -61,7 +61,7 @@ def looked_closely(
     unsettled: the recordings before the joint's edges were put where they are.
     """
     found = first.judge.select(until=lambda group: moves_joint(first, group))
-    look = plain = _of_best_form(Look(first, found, all_named(first, found)), unsettled, crew)
+    look = plain = _told_anew(Look(first, found, all_named(first, found)), unsettled, crew)
     known, moved = plain, ()
     refused: frozenset[tuple[str, str]] = frozenset()
     compared = _keys(plain)  # beside which names the forms of what moves readings were told apart
@@ -88,7 +88,7 @@ def looked_closely(
             look = known = Look(known.search, left, named)
             plain = known if known.search is first else plain
         elif any(group.is_slope for group in chosen):
-            look = known = _of_best_form(look, unsettled, crew)
+            look = known = _told_anew(look, unsettled, crew)
             moved = moved_now(search, known.chosen)  # both at their sizes
         elif _is_otherwise(look, known):
             known, moved = look, moved_now(search, look.chosen)
@@ -128,9 +128,13 @@ def _is_otherwise(look: Look, before: Look) -> bool:
     )
 
 
+def _told_anew(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Look:
+    """Return a look with names that stand at their sizes, and what moves readings as the law that leaves least."""
+    return _of_best_form(_told_at_size(look, unsettled, crew), unsettled, crew)
+
+
 def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Look:
     """Return a look with what moves readings as the law that leaves least at its size; delay and lag begin alike."""
-    look = _told_at_size(look, unsettled, crew)
     search, chosen, named = look.search, list(look.chosen), look.named
     for k, group in enumerate(look.chosen):
         if not moves_readings(search, group):
@@ -202,7 +206,8 @@ def _again_in(first: Competition, plain: Look, look: Look, unsettled: Sequence[R
 
     None where nothing that was found at first moves readings, or a name is none of the first competition's. A sensor's
     delay of 0.25 ms and a lag of it were 14 squares apart as long as nobody had named the 89 us that the commands are
-    late besides, and 1 with that.
+    late besides, and 1 with that. All of them stay: without a wear of 890 squares, in whose place a spring that was
+    found beside it left less, the true delay was 9 squares behind a lag, and no name for it.
     """
     if not any(moves_readings(first, group) for group in plain.chosen):
         return None
