@@ -27,11 +27,15 @@ HULL = 64
 _JUDGE_AFTER = 500
 """Samples in the window before an arrival can be called impossible."""
 _EARLY_IN_A_ROW = 50
-_APART_IN_A_ROW = 500
-_APART_SHARE = 0.1
-"""Of a period: when so many arrivals in a row lie further from the line than this, the sensor's clock has left it. Of
-delays that fall freely one in so many is short. A clock that was 0.8 % fast for 0.27 s bent the line within its
-tolerance; 6 s later it told instants 2 ms early, and a loop that went by them rang at full force."""
+_LATE_IN_A_ROW = 1000
+_FAST_SHARE = 0.005
+"""Of a period: an arrival so much earlier than the line allows is a new lowest one. Delays can't be below nothing, so
+behind the first few hundred there is none, but for a constant part that changed, and a clock that is fast."""
+_FAST_COUNT, _FAST_FADES = 5.0, 0.005
+"""Of them, and by how much each other arrival lessens the count: 0.3 % fast makes one of 20 arrivals such a one."""
+_CALM_IN_A_ROW = 100
+"""Arrivals without one before a clock that was fast is taken up anew. Kept on, its line was bent within the tolerance:
+0.8 % for 0.27 s had it 2 ms off 6 s later, and a loop that went by it rang at full force."""
 _LATE_MEANS = 8.0
 """Excess in mean delays that is an outlier of the host, not of the transport."""
 
@@ -54,7 +58,10 @@ CLOCK = np.dtype(
         ("early", "i8"),  # arrivals left out: before their sample could be there
         ("late", "i8"),  # arrivals left out of the mean delay
         ("early_in_a_row", "i8"),
-        ("apart_in_a_row", "i8"),  # arrivals later than the line, all of them
+        ("late_in_a_row", "i8"),
+        ("fast", "f8"),  # arrivals that were each the lowest, less a share of the others
+        ("was_fast", "i8"),  # there were too many of them: the line is bent
+        ("calm_in_a_row", "i8"),  # arrivals since the last of them
         ("active", "i8"),  # window that counts
         ("origin_sequence", "i8", (2,)),
         ("origin_t_ns", "i8", (2,)),
@@ -103,7 +110,9 @@ def _restart(state: np.ndarray, sequence: int, arrival_t_ns: int) -> None:
     s.samples = 0
     s.active = 0
     s.early_in_a_row = 0
-    s.apart_in_a_row = 0
+    s.late_in_a_row = 0
+    s.fast = 0.0
+    s.was_fast = 0
     s.slope_ns = 0.0
     _start_window(state, 0, sequence, arrival_t_ns)
     s.size[1] = -1  # not running yet
@@ -245,19 +254,30 @@ def step(state: np.ndarray, sequence: int, arrival_t_ns: int) -> None:
             # A wrong sequence number would poison the envelope; a clock that jumped stays away.
             s.early += 1
             s.early_in_a_row += 1
+            s.calm_in_a_row = 0
             if s.early_in_a_row < _EARLY_IN_A_ROW:
                 return
             s.restarts += 1
             _restart(state, sequence, arrival_t_ns)
-        else:
+        elif excess > max(_LATE_MEANS * s.delay_ns, 0.5 * s.period_ns):
+            s.late += 1
+            s.late_in_a_row += 1
             s.early_in_a_row = 0
-            s.apart_in_a_row = s.apart_in_a_row + 1 if excess > _APART_SHARE * s.period_ns + s.grid_ns else 0
-            if s.apart_in_a_row >= _APART_IN_A_ROW:
+            counts = False
+            if s.late_in_a_row >= _LATE_IN_A_ROW:
                 s.restarts += 1
                 _restart(state, sequence, arrival_t_ns)
-            elif excess > max(_LATE_MEANS * s.delay_ns, 0.5 * s.period_ns):
-                s.late += 1
-                counts = False
+                counts = True
+        else:
+            s.early_in_a_row = 0
+            s.late_in_a_row = 0
+            is_lowest = excess < -_FAST_SHARE * s.period_ns
+            s.fast = s.fast + 1.0 if is_lowest else max(s.fast - _FAST_FADES, 0.0)
+            s.was_fast = 1 if s.fast > _FAST_COUNT else s.was_fast
+            s.calm_in_a_row = 0 if is_lowest else s.calm_in_a_row + 1
+            if s.was_fast and s.calm_in_a_row >= _CALM_IN_A_ROW:
+                s.restarts += 1
+                _restart(state, sequence, arrival_t_ns)
 
     for w in range(2):
         if s.size[w] < 0:

@@ -71,6 +71,7 @@ _DRIVE_HOMES = (Phase.HOMING_DRIVE, Phase.HOMED_DRIVE)
 _HELD_S, _HELD_M = 0.02, 1e-4
 """How far a macro may be from where its drive held it that long before: settled, it moves 1.4 um (three machines)."""
 _JUMP_SETTLES_NS, _JUMPS_NS = 200_000_000, 1_000_000_000
+"""What its loop needs to stand where an encoder that jumped says; of one that goes on jumping, from the first jump."""
 _STARTS_S = 0.05  # in which a drive takes back the bits of a search before this one
 _ATTAINED_S = 0.05  # in which a drive counts from its index on, and settles there
 
@@ -452,8 +453,8 @@ class Servo:
         mode = Mode(self._asked.mode)
         in_phase_s = (t_ns - self._phase_since_t_ns) * 1e-9
         macro_state = cia402.state_of(seen.macro_statusword)
-        if self.phase is Phase.HOMED_DRIVE and self._settles_on_a_jump(t_ns):
-            return on, off
+        if self.phase is Phase.HOMED_DRIVE and self._encoder_jumped(t_ns):
+            return self._behind_a_jump(macro_state, t_ns)
         if self.phase in (Phase.IDLE, Phase.HOMED_DRIVE):
             wanted = mode is Mode.TRACK or (mode is Mode.HOME_DRIVE and self.phase is Phase.IDLE)
             if wanted and not silent:
@@ -633,26 +634,30 @@ class Servo:
                 return cia402.State.QUICK_STOP_ACTIVE, off
         return on, off
 
-    def _settles_on_a_jump(self, t_ns: int) -> bool:
-        """Tell whether the macro's encoder jumped so lately that its drive still makes for where that says it was.
-
-        It does so within its loop's time, and stands by the way of the jump aside. Stopped at once, it ramped down from
-        the speed of a jump of 0.6 mm in a cycle: 7.7 mm. It is stopped when it stands.
-        """
+    def _encoder_jumped(self, t_ns: int) -> bool:
+        """Tell whether the macro's encoder jumped since its drive has held the index on it."""
         if (t_ns - self._phase_since_t_ns) * 1e-9 <= _ATTAINED_S:
             self._encoder_jumps = self.decoder.encoder_jumps
         if self.decoder.encoder_jumps != self._encoder_jumps:
             self._encoder_jumps, self._jumped_t_ns = self.decoder.encoder_jumps, t_ns
             self._jumps_from_t_ns = self._jumps_from_t_ns or t_ns
-        if not self._jumped_t_ns:
-            return False
-        if t_ns - self._jumped_t_ns <= _JUMP_SETTLES_NS and t_ns - self._jumps_from_t_ns <= _JUMPS_NS:
-            return True
-        text = (
-            "while the drive held its index, it jumped by more than the motor moves in a cycle; check encoder and cable"
-        )
-        self._end(Stop.ENCODER_LOST, Phase.QUICK_STOP, t_ns, text)
-        return False
+        return self._jumped_t_ns != 0
+
+    def _behind_a_jump(self, state: cia402.State, t_ns: int) -> tuple[cia402.State, cia402.State]:
+        """Let the macro's drive stand where its encoder says it was, then stop it; whatever else is wrong stops it now.
+
+        Stopped at once, it ramped down from the speed of a jump of 0.6 mm in a cycle: 7.7 mm.
+        """
+        stop, text = self._refusal(Mode.HOME_DRIVE)
+        settles = t_ns - self._jumped_t_ns <= _JUMP_SETTLES_NS and t_ns - self._jumps_from_t_ns <= _JUMPS_NS
+        if stop is Stop.NONE and state is not cia402.State.OPERATION_ENABLED:  # it would be walked up, and search again
+            stop, text = Stop.DRIVE_FAULT, self._detail(Stop.DRIVE_FAULT)
+        elif stop is Stop.NONE and settles:
+            return cia402.State.OPERATION_ENABLED, cia402.State.SWITCH_ON_DISABLED
+        elif stop is Stop.NONE:
+            stop, text = Stop.ENCODER_LOST, "it jumped while the drive held its index on it; check encoder and cable"
+        self._end(stop, Phase.QUICK_STOP, t_ns, text)
+        return cia402.State.QUICK_STOP_ACTIVE, cia402.State.SWITCH_ON_DISABLED
 
     def _holds_index(self, in_phase_s: float) -> bool:
         """Tell whether the macro is where its drive held it; no law or guard looks at it meanwhile.

@@ -262,10 +262,11 @@ def test_a_drive_that_gives_another_force(oled_profile, axis, allowed_n, sign):
 
 
 def test_a_force_that_is_wrong_now_and_then_is_none_that_goes_unheeded(cycle):
-    """Five frames in a row whose bits turned over; every ninth cycle for good."""
+    """Five frames in a row whose bits turned over, and one in eleven for good."""
     for k in range(2000):
-        wrong = k % 70 < 5 or (k > 1000 and k % 11 == 0)
-        assert cycle.next(macro_reported_force_n=500.0 if wrong and k % 70 < 5 else 0.0) is Stop.NONE
+        wrong = k % 70 < 5 if k < 1000 else k % 11 == 0
+        assert cycle.next(macro_reported_force_n=500.0 if wrong else 0.0) is Stop.NONE
+    assert Stop.FORCE_UNHEEDED in [cycle.next(macro_reported_force_n=500.0 * (k % 9 == 0)) for k in range(2000)]
 
 
 def test_a_force_that_is_not_told_or_not_asked_for_is_not_judged(oled_profile):

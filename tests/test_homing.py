@@ -195,26 +195,35 @@ def test_a_drive_that_goes_dark_as_it_lets_go_is_named(tmp_path, single_profile,
         assert not stage.status()["stop"]
 
 
+def once_held(backend, after_ns, strike):
+    """What a supervisor observes: so long after the index is held first, `strike` is called with that time."""
+    held_t_ns: list[int] = []
+    struck_t_ns: list[int] = []
+
+    def observe(rows):
+        held_t_ns.extend(rows["t_ns"][rows["run_phase"] == Phase.HOMED_DRIVE])
+        if not struck_t_ns and held_t_ns and backend.wire.t_ns - held_t_ns[0] > after_ns:
+            struck_t_ns.append(backend.wire.t_ns)
+            strike(struck_t_ns[0])
+
+    return observe, struck_t_ns
+
+
 @pytest.mark.parametrize("tells", [True, False], ids=["the drive tells", "its word is lost"])
 def test_a_drive_that_is_sent_off_its_index_is_stopped(tells, tmp_path, single_profile, single_machine):
     """Another master changes the mode of the drive that holds, and it makes for a target that nobody gave."""
     backend = BatchBackend(single_machine, seed=1)
-    held_t_ns: list[int] = []
-    struck_t_ns = 0
+    step_m = single_profile.macro.encoder_step_m
 
-    def strike(rows):
-        nonlocal struck_t_ns
-        held_t_ns.extend(rows["t_ns"][rows["run_phase"] == Phase.HOMED_DRIVE])
-        if not struck_t_ns and held_t_ns and backend.wire.t_ns - held_t_ns[0] > 100_000_000:
-            struck_t_ns = backend.wire.t_ns
-            step_m = single_profile.macro.encoder_step_m
-            if not tells:
-                backend.rig.inject(Fault("drop_frame", can_id=0x280 + MACRO, duration_s=1e3), struck_t_ns)
-            for index, value in ((cia402.TARGET_POSITION, round(0.002 / step_m)), (cia402.MODES_OF_OPERATION, 8)):
-                fault = Fault("object_change", node_id=MACRO, index=index, subindex=0, value=value)
-                backend.rig.inject(fault, struck_t_ns)
+    def strike(t_ns):
+        if not tells:
+            backend.rig.inject(Fault("drop_frame", can_id=0x280 + MACRO, duration_s=1e3), t_ns)
+        for index, value in ((cia402.TARGET_POSITION, round(0.002 / step_m)), (cia402.MODES_OF_OPERATION, 8)):
+            fault = Fault("object_change", node_id=MACRO, index=index, subindex=0, value=value)
+            backend.rig.inject(fault, t_ns)
 
-    with Supervisor(single_profile, backend, tmp_path / "run", observe=strike) as stage:
+    observe, struck_t_ns = once_held(backend, 100_000_000, strike)
+    with Supervisor(single_profile, backend, tmp_path / "run", observe=observe) as stage:
         outcome = stage.home()
         truth = backend.rig.truth.arrays()
     if tells:
@@ -223,43 +232,51 @@ def test_a_drive_that_is_sent_off_its_index_is_stopped(tells, tmp_path, single_p
     else:
         assert outcome.stop is Stop.FOLLOWING_ERROR
         assert "its mode say" in outcome.detail
-    away = truth["t_ns"] > struck_t_ns
+    away = truth["t_ns"] > struck_t_ns[0]
     fastest_m_per_s = np.abs(truth["macro_velocity_m_per_s"][away]).max()
     assert (0.0 if tells else 0.01) < fastest_m_per_s < (0.06 if tells else 0.12)
     assert np.ptp(truth["macro_position_m"][away]) < (0.5e-3 if tells else 1.5e-3)  # of the 2 mm that it was sent
     assert not read_run(tmp_path / "run").rows["homing_id"].any()
 
 
+def jumped_while_held(backend, tmp_path, profile, for_s, *more):
+    """Home with an encoder that jumps by 0.59 mm while the index is held, and other faults then: what was seen."""
+
+    def strike(t_ns):
+        for fault in (Fault("encoder_jump", node_id=MACRO, offset_m=-590e-6, duration_s=for_s), *more):
+            backend.rig.inject(fault, t_ns)
+
+    observe, struck_t_ns = once_held(backend, 60_000_000, strike)
+    with Supervisor(profile, backend, tmp_path / "run", observe=observe) as stage:
+        outcome = stage.home()
+        stage.pump(1.0)
+        truth = backend.rig.truth.arrays()
+    assert not read_run(tmp_path / "run").rows["homing_id"].any()
+    behind = truth["t_ns"] > struck_t_ns[0]
+    return outcome, truth["macro_position_m"][behind], truth["macro_drive_state"][behind]
+
+
 @pytest.mark.parametrize("for_s", [0.317, 1e3], ids=["and comes back", "for good"])
-def test_an_encoder_that_jumps_while_the_index_is_held_on_it_is_no_reason_to_ramp_down(
+def test_an_encoder_that_jumps_under_a_held_index_is_no_reason_to_ramp_down(
     for_s, tmp_path, oled_profile, oled_machine
 ):
     """Its drive goes with it, by that and its loop's overshoot; stopped at once it made 7.7 mm of a jump of 0.6 mm."""
     backend = BatchBackend(oled_machine, seed=1)
-    held_t_ns: list[int] = []
-    jumped_t_ns = 0
-
-    def strike(rows):
-        nonlocal jumped_t_ns
-        held_t_ns.extend(rows["t_ns"][rows["run_phase"] == Phase.HOMED_DRIVE])
-        if not jumped_t_ns and held_t_ns and backend.wire.t_ns - held_t_ns[0] > 60_000_000:
-            jumped_t_ns = backend.wire.t_ns
-            fault = Fault("encoder_jump", node_id=MACRO, offset_m=-590e-6, duration_s=for_s)
-            backend.rig.inject(fault, jumped_t_ns)
-
-    with Supervisor(oled_profile, backend, tmp_path / "run", observe=strike) as stage:
-        outcome = stage.home()
-        stage.pump(1.0)
-        truth = backend.rig.truth.arrays()
+    outcome, position_m, state = jumped_while_held(backend, tmp_path, oled_profile, for_s)
     assert outcome.stop is Stop.ENCODER_LOST
-    assert outcome.detail.startswith(
-        "while the drive held its index, it jumped by more than the motor moves in a cycle"
-    )
-    held = (truth["t_ns"] > jumped_t_ns) & (truth["macro_drive_state"] != DriveState.SWITCH_ON_DISABLED)
-    moved_m = np.abs(truth["macro_position_m"][held] - truth["macro_position_m"][held][0]).max()
-    assert 0.5e-3 < moved_m < 1.2 * 590e-6
-    rows = read_run(tmp_path / "run").rows
-    assert not rows["homing_id"].any()
+    assert outcome.detail.startswith("it jumped while the drive held its index on it; ")
+    held_m = position_m[state != DriveState.SWITCH_ON_DISABLED]
+    assert 0.5e-3 < np.abs(held_m - held_m[0]).max() < 1.2 * 590e-6
+
+
+def test_a_drive_that_lets_go_while_a_jump_is_waited_out_gets_no_power_again(tmp_path, oled_profile, oled_machine):
+    """It would be walked up with the start of a homing set, and search its index once more."""
+    backend = BatchBackend(oled_machine, seed=1)
+    turned = Fault("corrupt_frame", at_s=0.05, can_id=0x200 + MACRO, bits=0x2, count=1, duration_s=0.1)
+    outcome, _, state = jumped_while_held(backend, tmp_path, oled_profile, 1e3, turned)
+    assert outcome.stop is Stop.DRIVE_FAULT
+    off = np.flatnonzero(state == DriveState.SWITCH_ON_DISABLED)
+    assert not (state[off[0] :] == DriveState.OPERATION_ENABLED).any()
 
 
 PATIENT = {"trip__sensor_age_s": 0.3, "trip__overrun_s": 0.3, "trip__rpdo_deadline_s": 0.1}

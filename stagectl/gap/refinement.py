@@ -31,7 +31,7 @@ that is 1e-4 off leaves a thousand."""
 _BRACKET = 2.2  # from the grid's place, up and down
 _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one turn over the travel
 _ANCHOR_M = 1.0
-_MOVED_PLACE_M = 0.1
+_MOVED_PLACE_M = 0.1  # any: between two places a law about a place is a straight line
 _NEAR_ZERO = 0.05
 LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)

@@ -328,7 +328,7 @@ class Judge:
                 continue
             rest = [other for other in found if other is not group]
             parts = self._two_like(rest, group)
-            as_good = self._worth([*rest, *parts]) > self._worth(found) - self._alike(found, group)
+            as_good = self._worth([*rest, *parts]) > self._worth(found) - self._excused_of_parts(found, group)
             if parts and as_good and self._allowed([*rest, *parts]):
                 found = [*rest, *parts]
         return found
@@ -437,12 +437,12 @@ class Judge:
         now = self.gain(beside)
         gains = {id(group): self.gain([*beside, group]) - now for group in candidates}
         best = max(candidates, key=lambda group: gains[id(group)] - self.price() * _form(group))
-        alike = self._alike_beside([*beside, best])
+        excused = self._excused_beside([*beside, best])
         near = [
             group
             for group in candidates
             if group.complexity < best.complexity
-            and gains[id(best)] - gains[id(group)] < alike(best, group, gains[id(best)])
+            and gains[id(best)] - gains[id(group)] < excused(best, group, gains[id(best)])
         ]
         return max(near, key=lambda group: gains[id(group)] - self.price() * group.complexity, default=best)
 
@@ -615,7 +615,7 @@ class Judge:
             total += float(apart @ s.gram @ apart)
         return total
 
-    def _alike_beside(self, chosen: Sequence[Group]) -> Callable[[Group, Group, float], float]:
+    def _excused_beside(self, chosen: Sequence[Group]) -> Callable[[Group, Group, float], float]:
         """Return (better, simpler, gain of the better) -> by how much less the simpler one may gain; `chosen` stay.
 
         Smooth laws are as exact as they come; where no curve is left beside what stays, others are more so than where
@@ -625,13 +625,13 @@ class Judge:
         share = ALIAS_SHARE if self.leaves_curve(chosen) else EXACT_RATIO
         left = self._left_at_most(chosen)
 
-        def alike(better: Group, simpler: Group, gained: float) -> float:
+        def excused(better: Group, simpler: Group, gained: float) -> float:
             ratio = SMOOTH_RATIO if _is_smooth(better) and _is_smooth(simpler) else share
             return ALIAS_GAIN + min(ratio * gained, left)
 
-        return alike
+        return excused
 
-    def _alike(self, chosen: Sequence[Group], group: Group) -> float:
+    def _excused_of_parts(self, chosen: Sequence[Group], group: Group) -> float:
         """Return by how much less than bristles, one of `chosen`, a level and a rise may gain and still be as good.
 
         As laws they are as exact as smooth ones, up to the speed over which a sign turns, which the grid has: bristles

@@ -75,7 +75,8 @@ BARS = (TRAVEL, STRUCK, LIMP, STANDSTILL, BEGUN, LOST, UNREADABLE, STRANGER, BAC
 GENTLE = (
     "and 20 um; a: the greatest gain of speed until it was noticed, at most a plan's; behind an obstacle forward only, "
     "and back by its drive's overshoot; of an encoder that jumps 1.2 times that; of an end that swings what its blow "
-    "gives; of a deaf drive from its own watch on"
+    "gives; of a deaf drive from its own watch on, of one that is told late from there on; beside a limp micro "
+    "a by 0.17 m/s^2 more"
 )
 """Where the bound differs from v t + a t^2 / 2 + (v + a t)^2 / (2 ramp) with what was true at the fault."""
 

@@ -447,8 +447,10 @@ def test_parts_are_named():
         (["gap", "--part", "speed"], "--part speed: gap has no parts"),
         (["paper", "--seeds", "7"], "--seeds: paper has no runs"),
         (["service", "--part", "soak", "--seeds", "7"], "--seeds with --part soak: choose from batch, processes"),
-        (["service", "--seeds", "seven"], "argument --seeds: invalid seeds_of value: 'seven'"),
-        (["service", "--seeds", "9-7"], "argument --seeds: invalid"),
+        (["service", "--seeds", "seven"], "'seven' is no seed; write 7, 100-140 or"),
+        (["service", "--seeds", "9-7"], "9-7 holds no seed"),
+        (["service", "--seeds", "0-999999999999"], "or more than 100000"),
+        (["service", "--seeds", "nan"], "'nan' is no seed"),
     ],
 )
 def test_what_cannot_be_measured_is_wrong_usage(asked, said, capsys):
