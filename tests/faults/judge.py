@@ -247,8 +247,11 @@ def judge(drawn: Drawn, facts: Facts, record: Record, of: Mechanics | None = Non
 
 
 def _drive_homes(drawn: Drawn, facts: Facts) -> bool:
-    """Tell whether the macro's drive homed by itself while the lasers failed: the micro gets power when a law does."""
-    if not drawn.by_lasers or facts.phase != "homing":
+    """Tell whether the macro's drive homed by itself while the lasers failed, or the micro's drive was told nothing.
+
+    The micro gets power when a law does.
+    """
+    if not (drawn.by_lasers or drawn.deaf == (MICRO,)) or facts.phase != "homing":
         return False
     failed = facts.fault_t_ns, facts.fault_t_ns + round(1e9 * (drawn.lasts_s + drawn.detection_s))
     at, end = (int(np.searchsorted(facts.seen["t_ns"], t_ns)) for t_ns in failed)

@@ -553,9 +553,20 @@ def test_a_drive_goes_with_its_own_encoder_and_no_further():
         assert bars_missed(facts, record, lies) == missed
 
 
-def test_lasers_that_fail_need_not_stop_a_drive_that_homes_by_itself():
-    silent = replace(FAULT, by_lasers=True)
-    for powered, drawn, missed in ((False, silent, set()), (True, silent, {COURSE}), (False, FAULT, {COURSE})):
+def test_what_only_a_law_needs_need_not_stop_a_drive_that_homes_by_itself():
+    silent, macro_deaf, micro_deaf = (
+        replace(FAULT, by_lasers=True),
+        replace(FAULT, deaf=(MACRO,)),
+        replace(FAULT, deaf=(MICRO,)),
+    )
+    for powered, drawn, missed in (
+        (False, silent, set()),
+        (True, silent, {COURSE}),
+        (False, micro_deaf, set()),
+        (True, micro_deaf, {COURSE}),
+        (False, macro_deaf, {COURSE}),
+        (False, FAULT, {COURSE}),
+    ):
         facts, record = unstopped("at rest")
         facts.phase = "homing"
         facts.seen["states"][:, 1] = 1
