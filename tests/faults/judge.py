@@ -341,7 +341,10 @@ def _too_far(seen: dict[str, Any], at: int, end: int, of: Mechanics) -> list[tup
 
 
 def _rest(seen: dict[str, Any], at: int, end: int, noticed_t_ns: int | None) -> int | None:
-    """Return the sample at which the macro had come to rest, or was let go of at rest; None where it did not."""
+    """Return the sample at which the macro had come to rest, or was let go of at rest; None where it did not.
+
+    Its drive takes the power from what stands in one cycle, and in the next the motor no longer holds it.
+    """
     states, velocity = seen["states"][at:end, 0], seen["macro_velocity_m_per_s"][at:end]
     starts = np.flatnonzero(states != ENABLED)[:1].tolist()
     if noticed_t_ns is not None:
@@ -350,10 +353,11 @@ def _rest(seen: dict[str, Any], at: int, end: int, noticed_t_ns: int | None) -> 
         stood = velocity.size >= REST_SAMPLES and bool((np.abs(velocity) < REST_M_PER_S).all())
         return at if stood else None
     first = min(starts)
-    slow = np.concatenate([[0], np.cumsum(np.abs(velocity[first:]) < REST_M_PER_S)])
-    found = np.flatnonzero(slow[REST_SAMPLES:] - slow[:-REST_SAMPLES] == REST_SAMPLES)[:1].tolist()
-    let_go = ~np.isin(states[first:], _POWERED) & (np.abs(velocity[first:]) < REST_M_PER_S)
-    found += np.flatnonzero(let_go)[:1].tolist()
+    slow, powered = np.abs(velocity[first:]) < REST_M_PER_S, np.isin(states[first:], _POWERED)
+    slow_count = np.concatenate([[0], np.cumsum(slow)])
+    found = np.flatnonzero(slow_count[REST_SAMPLES:] - slow_count[:-REST_SAMPLES] == REST_SAMPLES)[:1].tolist()
+    stood = np.concatenate([[False], powered[:-1] & slow[:-1]])
+    found += np.flatnonzero(~powered & (slow | stood))[:1].tolist()
     return at + first + min(found) if found else None
 
 

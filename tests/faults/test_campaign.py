@@ -227,6 +227,16 @@ def test_judges_see_an_axis_that_is_let_go_of_before_it_rests():
     assert bars_missed(facts, record) == {TRAVEL, STANDSTILL}
 
 
+def test_a_drive_lets_go_of_what_stood_a_cycle_before():
+    for speed_m_per_s, missed in ((0.9e-3, set()), (1.5e-3, {TRAVEL, STANDSTILL})):
+        facts, record = rest_after(2.0)
+        facts.seen["macro_velocity_m_per_s"][1219] = speed_m_per_s
+        facts.seen["macro_velocity_m_per_s"][1220:] = np.linspace(1.2e-3, 0.05, 780)  # its power went: it rolls
+        facts.seen["macro_position_m"][:] = np.cumsum(facts.seen["macro_velocity_m_per_s"]) * 1e-3
+        facts.seen["states"][1220:] = 1
+        assert bars_missed(facts, record) == missed
+
+
 @pytest.mark.parametrize(("speed_m_per_s", "missed"), [(0.0, set()), (3e-3, {STANDSTILL})])
 def test_a_macro_that_a_homing_had_let_go_of_rolls_and_was_at_rest_then(speed_m_per_s, missed):
     """Between the drive's homing and the law's power it has none; counts that are stuck are noticed there."""
