@@ -76,7 +76,7 @@ GENTLE = (
     "and 20 um; a: the greatest gain of speed until it was noticed, at most a plan's; behind an obstacle forward only, "
     "and back by its drive's overshoot; of an encoder that jumps 1.2 times that; of an end that swings what its blow "
     "gives; of a deaf drive from its own watch on, of one that is told late from there on; beside a limp micro "
-    "a by 0.17 m/s^2 more"
+    "a by 0.17 m/s^2 more; a macro at rest that frames told another force what that throws it by"
 )
 """Where the bound differs from v t + a t^2 / 2 + (v + a t)^2 / (2 ramp) with what was true at the fault."""
 
@@ -261,8 +261,10 @@ def _drive_homes(drawn: Drawn, facts: Facts) -> bool:
 def _unstopped(drawn: Drawn, facts: Facts, record: Record, of: Mechanics, blind_s: float) -> list[tuple[str, str]]:
     """Judge a run in which nothing stopped the motion but its own end, or the operator."""
     holds_m = of.error_limit_m if drawn.swings else STANDSTILL_M
-    found = [(STANDSTILL, text) for text in not_at_rest(facts, holds_m)]
-    found += [(TRAVEL, text) for text in astray(facts, record.columns, facts.judged_until_t_ns, of, blind_s)]
+    kicked_m_per_s, kicked_m = of.kicked(drawn.kicked_words, drawn.kicked_s)
+    found = [(STANDSTILL, text) for text in not_at_rest(facts, holds_m, kicked_m)]
+    until_t_ns = facts.judged_until_t_ns
+    found += [(TRAVEL, text) for text in astray(facts, record.columns, until_t_ns, of, blind_s, kicked_m_per_s)]
     found += [(TRAVEL, text) for text in not_ended(facts, record.columns, of)]
     if facts.stop_asked_t_ns:
         seen = facts.seen

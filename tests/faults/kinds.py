@@ -52,6 +52,8 @@ class Drawn:
     without_power: tuple[int, ...] = ()  # nodes that can't brake
     deaf: tuple[int, ...] = ()  # nodes that hear no command: their own watch stops them
     told_late_s: float = 0.0  # by which what the macro's drive is told comes late: its stop, too
+    kicked_s: float = 0.0  # for which the macro's drive is told a force that is not the law's,
+    kicked_words: int = 0  # by how many 0.1 % of its rated one
     open_loop: bool = False  # the drive keeps its last force until the fault is noticed
     silent: bool = False  # the operator says nothing more: a jog ends by its own hold, before the lease does
     encoder_m: float = 0.0  # by which the drive's own encoder is off for a while: it holds on that
@@ -133,7 +135,8 @@ def frames_corrupted(rng: np.random.Generator, phase: str) -> Drawn:
     text, node_id = f"{count} frames 0x{can_id:03X} with bits 0x{bits:08X}", can_id & 0x7F
     order = order_of(_ENABLE_OPERATION ^ bits & 0xFFFF) if can_id in RPDOS else Order.ENABLE_OPERATION
     if order == Order.ENABLE_OPERATION:
-        return Drawn(text, (fault,), must_stop=False, lasts_s=0.1)
+        words = bits >> 16 if can_id == MACRO_RPDO else 0
+        return Drawn(text, (fault,), must_stop=False, lasts_s=0.1, kicked_s=count * CYCLE_S, kicked_words=words)
     return Drawn(
         text,
         (fault,),

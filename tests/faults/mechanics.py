@@ -9,13 +9,13 @@ import numpy as np
 from sim_backend import drive_servo
 from sim_backend.machine import Machine, load_machine
 from stagectl.profile import PROFILES_FOLDER
+from tests.faults.kinds import CYCLE_S
 
 _PLAN_SHARE, _PLAN_RAMP_SHARE, _JERK_TIME_S = 0.9, 0.5, 0.1  # what moves are planned with
 _TOUCH_N = 5.0  # no joint is pressed harder
 REST_M_PER_S = 1e-3
 STANDSTILL_M = 20e-6  # a drive that holds on its encoder gives way so far when a force changes
 SETTLING_M = 200e-6  # how far its position loop may go until it stands
-_KICK_S = 1e-3  # for which a wrong force is a drive's target: the next command takes it back
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Mechanics:
     plan_m_per_s3: float
     speed_limit_m_per_s: float  # the guard's
     force_limit_n: float  # of the macro's drive, 0x6072
+    rated_force_n: float  # of the macro's drive, 0x6076
     travel_m: tuple[float, float]  # in which the guard wants to be able to stop it
     error_limit_m: float  # of the end, at which the guard stops a motion
 
@@ -65,7 +66,16 @@ class Mechanics:
     @property
     def kick_m_per_s(self) -> float:
         """How much faster the macro gets by its greatest force in a cycle, as one frame that is not the law's asks."""
-        return self.force_limit_n / self.machine.macro.mass_kg * _KICK_S
+        return self.force_limit_n / self.machine.macro.mass_kg * CYCLE_S
+
+    def kicked(self, words: int, kicked_s: float) -> tuple[float, float]:
+        """Return how fast the macro gets, and from rest how far it goes, by a force that its drive is told so wrongly.
+
+        `words`: by how many 0.1 % of its rated force. A sample and a command on it is taken back, then a ramp's way.
+        """
+        force_n = min(words * 1e-3 * self.rated_force_n, self.force_limit_n)
+        v = force_n / self.machine.macro.mass_kg * kicked_s
+        return v, v * (0.5 * kicked_s + 2.0 * CYCLE_S) + v * v / (2.0 * self.ramp_m_per_s2)
 
     def coasting_m_per_s(self, position_m: float, velocity_m_per_s: float) -> float:
         """Return how fast a macro may get that loses its power there: the guard's limit, and what it rolls down."""
@@ -97,6 +107,7 @@ def mechanics_of(name: str) -> Mechanics:
         plan / _JERK_TIME_S,
         macro["velocity_limit_m_per_s"],
         macro["force_limit_n"],
+        macro["rated_force_n"],
         (low_m - stray_m, high_m + stray_m),
         stray_m,
     )

@@ -453,6 +453,17 @@ def test_an_end_that_its_motor_cannot_hold_moves_its_macro_by_the_error_limit_at
     assert bars_missed(facts, record, replace(GOES_BY, swings=True)) == missed
 
 
+@pytest.mark.parametrize(
+    ("moved_m", "words", "missed"),
+    [(270e-6, 8192, set()), (310e-6, 8192, {STANDSTILL}), (21e-6, 64, set()), (30e-6, 64, {STANDSTILL})],
+)
+def test_a_macro_at_rest_is_thrown_by_a_force_that_a_frame_told_its_drive_wrongly(moved_m, words, missed):
+    """2 kN on 70.7 kg for 1 ms: 28 mm/s; 71 um until they are taken back, 200 um by the ramp; 32 N: 1.2 um in all."""
+    facts, record = unstopped("at rest")
+    facts.seen["macro_position_m"][1001:1030] += moved_m
+    assert bars_missed(facts, record, replace(GOES_BY, kicked_words=words, kicked_s=1e-3)) == missed
+
+
 @pytest.mark.parametrize("phase", ["constant speed", "jogging", "identifying"])
 def test_a_motion_that_leaves_its_reference_is_seen_without_a_fault_too(phase):
     """The guard's limit is 200 um; 3 ms of 0.4 m/s until it can have noticed."""

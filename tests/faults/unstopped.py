@@ -22,17 +22,23 @@ _KEPT = ("at rest", "accelerating", "constant speed", "decelerating", "jogging",
 
 
 def astray(
-    facts: Facts, columns: dict[str, np.ndarray], until_t_ns: int, of: Mechanics, blind_s: float = 0.0
+    facts: Facts,
+    columns: dict[str, np.ndarray],
+    until_t_ns: int,
+    of: Mechanics,
+    blind_s: float = 0.0,
+    kicked_m_per_s: float = 0.0,
 ) -> list[str]:
     """Return where the true motion, from the fault until then, was not the one that was asked for.
 
     For `blind_s` nobody sees the stage: the drive keeps its force, while magnets and cables change theirs.
+    `kicked_m_per_s`: what frames may have given the macro whose force was not the law's; of one it is allowed always.
     """
     seen = facts.seen
     at, end = (int(np.searchsorted(seen["t_ns"], t_ns)) for t_ns in (facts.fault_t_ns, until_t_ns))
     found = []
     fastest = float(np.abs(seen["macro_velocity_m_per_s"][at:end]).max(initial=0.0))
-    allowed = GAIN_SHARE * facts.planned_m_per_s + of.kick_m_per_s + of.drift_m_per_s2 * blind_s
+    allowed = GAIN_SHARE * facts.planned_m_per_s + max(of.kick_m_per_s, kicked_m_per_s) + of.drift_m_per_s2 * blind_s
     if facts.planned_m_per_s > 0.0 and not fastest <= allowed:
         found.append(f"macro was {fastest:.3f} m/s fast, asked for were {facts.planned_m_per_s:.3f}")
     if facts.phase not in _KEPT:
@@ -104,10 +110,11 @@ def moved_at_rest(seen: dict[str, Any], from_t_ns: int, until_t_ns: int) -> list
     return found
 
 
-def not_at_rest(facts: Facts, holds_m: float) -> list[str]:
+def not_at_rest(facts: Facts, holds_m: float, kicked_m: float = 0.0) -> list[str]:
     """Return how a stage moved that holds, or has come to rest with power.
 
     `holds_m`: how far its macro may; that of an end which its own motor can't hold goes with it, as far as that may.
+    `kicked_m`: how far frames may have thrown it whose force was not the law's.
     """
     seen = facts.seen
     at, end = (int(np.searchsorted(seen["t_ns"], t_ns)) for t_ns in (facts.fault_t_ns, facts.judged_until_t_ns))
@@ -117,7 +124,7 @@ def not_at_rest(facts: Facts, holds_m: float) -> list[str]:
         first = int(np.flatnonzero(powered)[0])
         moved_m = float(np.abs(position[first:][powered[first:]] - position[first]).max())
         limit_m = holds_m if facts.phase == "at rest" else SETTLING_M
-        if not moved_m <= limit_m:
+        if not moved_m <= limit_m + kicked_m:
             found.append(f"macro moved {moved_m * 1e6:.0f} um while it held")
     speed = abs(float(seen["macro_velocity_m_per_s"][end - 1]))
     if powered.size and powered[-1] and not speed < REST_M_PER_S:
