@@ -51,8 +51,7 @@ def stop_detail(stop: Stop, m: Any, now: Any, command: Any, g: Any, node_ids: di
 def _travel(m: Any, now: Any, g: Any) -> str:
     return (
         f"macro at {m['macro_position_m']:.5f} m, travel and following error allow {g['travel_low_m']:g} .. "
-        f"{g['travel_high_m']:g} m; "
-        "move it back by hand, then home"
+        f"{g['travel_high_m']:g} m; home it, its drive brings it back, or move it back by hand"
     )
 
 

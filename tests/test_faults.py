@@ -539,7 +539,7 @@ def test_a_stage_outside_its_travel_is_not_moved(tmp_path, oled_profile, oled_ma
     one = Stage(tmp_path / "run", profile, oled_machine)
     with one:
         assert one.stage.enable() is Stop.TRAVEL
-        said = r"macro at 0\.01\d+ m, travel and following error allow -0\.4002 \.\. 0\.0052 m; move it back"
+        said = r"macro at 0\.01\d+ m, travel and following error allow -0\.4002 \.\. 0\.0052 m; home it"
         assert re.search(said, one.stage.detail)
     assert replay(tmp_path / "run").exact
 

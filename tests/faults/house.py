@@ -90,7 +90,7 @@ class House:
 
     def ready(self) -> str:
         """Bring the stage to armed: acknowledge, home, arm; return what stands in the way."""
-        client, last = self.daemon.client, ""
+        client, last, is_beyond = self.daemon.client, "", False
         give_up_s = time.monotonic() + _PATIENCE_S
         while time.monotonic() < give_up_s:
             try:
@@ -104,10 +104,12 @@ class House:
                     client.take_lease("anna", 2.0)
                     self._operator.hold(client.lease_token)
                 if status.fault is not None:
+                    is_beyond = status.fault.kind == "TRAVEL"
                     client.acknowledge(status.fault.number)
-                elif status.state == "idle" and not status.homed:
+                elif status.state == "idle" and (is_beyond or not status.homed):  # as the fault TRAVEL says
                     self._ask_for_power()
                     client.home()
+                    is_beyond = False
                 elif status.state == "idle":
                     self._ask_for_power()
                     client.arm()

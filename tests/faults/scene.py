@@ -449,7 +449,7 @@ class Scene:
                 return f"not acknowledged: {done.text if done else self.status.state}"
         if not self.until(lambda: self.status.state in ("idle", "armed")):
             return f"still {self.status.state}: {self.status.waiting_for}"
-        if not self.status.homed:
+        if not self.status.homed or (fault is not None and fault.kind == "TRAVEL"):  # as that fault says
             self._ask_for_power()
             homed = self.do("home", messages.Home())
             if homed is None or homed.stop != "FINISHED":
