@@ -34,7 +34,9 @@ _REST_WINDOW_NS = 50_000_000
 _STILL_WINDOWS = 2
 _LEAST_STOPPING_S = 0.3
 _SETTLING_NS = 100_000_000
-"""From the reference's rest until power goes: cut in its last cycle, the force that braked the macro threw it back."""
+"""From the reference's and the macro's rest until power goes: cut in its last cycle, what braked threw it back."""
+_LONGEST_SETTLING_NS = 2_000_000_000
+"""Until power goes although the macro is not at rest: beside an end that its motor can't hold it swings with 4 mm/s."""
 _INTERLOCKS = SAFE_TORQUE_OFF | PRESSURE_LOW
 _LIMIT_SWITCHES = NEGATIVE_LIMIT | POSITIVE_LIMIT
 _RELATIVE_KEPT_RATIO = 0.9  # of the relative speed, from cycle to cycle of a stop
@@ -194,7 +196,7 @@ class Servo:
         self._command_lost = 0
         self._last_cycle = -1
         self._deadline_t_ns = 0
-        self._rest_mark_t_ns = 0
+        self._rest_mark_t_ns = self._settles_from_t_ns = 0
         self._rest_mark_m = 0.0
         self._still_windows_count = 0
         self._rests_from_t_ns = 0  # before that no ramp can have brought it to rest
@@ -509,6 +511,8 @@ class Servo:
         if self.phase is Phase.STOPPING:
             self._need_no_lease()
             if self.tracker.hold["velocity_m_per_s"][0] != 0.0:
+                self._rest_mark_t_ns = self._settles_from_t_ns = t_ns
+            elif not self._macro_is_slow() and t_ns - self._settles_from_t_ns <= _LONGEST_SETTLING_NS:
                 self._rest_mark_t_ns = t_ns
             if t_ns - self._rest_mark_t_ns > _SETTLING_NS and in_phase_s > _LEAST_STOPPING_S:
                 self._enter(Phase.STOPPED, t_ns)
@@ -568,6 +572,7 @@ class Servo:
     def _look_for_rest(self, t_ns: int) -> None:
         """Look from here on whether the macro's encoder stands."""
         self._rest_mark_t_ns, self._rest_mark_m = t_ns, float("nan")
+        self._settles_from_t_ns = t_ns
         self._still_windows_count = 0
 
     def _stands(self, t_ns: int) -> bool:
@@ -587,10 +592,13 @@ class Servo:
         self._still_windows_count = self._still_windows_count + 1 if moved_m <= _REST_M_PER_S * since_s else 0
         return self._still_windows_count >= _STILL_WINDOWS
 
+    def _macro_is_slow(self) -> bool:
+        """Tell whether the law sees the macro as good as at rest."""
+        return abs(float(self.tracker.active.model["macro_velocity_m_per_s"][0])) < _REST_M_PER_S
+
     def _guided(self, t_ns: int, in_phase_s: float) -> tuple[cia402.State, cia402.State]:
         """Keep the micro on the braking macro until that is slow, or until the sensor falls silent."""
-        slow = abs(float(self.tracker.active.model["macro_velocity_m_per_s"][0])) < _REST_M_PER_S
-        if (slow and in_phase_s > 0.1) or in_phase_s > _QUICK_STOP_TIMEOUT_S:
+        if (self._macro_is_slow() and in_phase_s > 0.1) or in_phase_s > _QUICK_STOP_TIMEOUT_S:
             self._look_for_rest(t_ns)
             self._enter(Phase.QUICK_STOP, t_ns)
             return cia402.State.QUICK_STOP_ACTIVE, cia402.State.QUICK_STOP_ACTIVE

@@ -267,6 +267,27 @@ def test_an_axis_without_torque_is_said_to_coast(tmp_path, oled_profile, oled_ma
     assert seen.replays() == ""
 
 
+def test_a_stage_that_swings_keeps_its_power_until_it_rests(tmp_path, oled_profile, oled_machine):
+    """An end that its motor can't hold, and a law that fights for it: macro let go of at 4 mm/s when only the
+    reference was looked at.
+    """
+
+    def strike(stage, backend):
+        inject(Fault("weak_motor", at_s=0.06, node_id=MICRO, force_ratio=0.45, duration_s=1.0))(stage, backend)
+        let_the_lease_go(stage, backend)
+
+    seen = struck(tmp_path / "run", oled_profile, oled_machine, strike)
+    assert seen.outcome.stop is Stop.LEASE
+    stopping = seen.run.rows[seen.run.rows["run_phase"] == Phase.STOPPING]
+    reference_rests_t_ns = stopping["t_ns"][np.flatnonzero(stopping["setpoint_velocity_m_per_s"] != 0.0)[-1]]
+    let_go = np.searchsorted(seen.truth["t_ns"], stopping["t_ns"][-1])
+    swings = slice(np.searchsorted(seen.truth["t_ns"], reference_rests_t_ns + 50_000_000), let_go)
+    speed = np.abs(seen.truth["macro_velocity_m_per_s"])
+    assert speed[swings].max() > 2.0 * REST_M_PER_S
+    assert speed[let_go - 50 : let_go + 1].max() < REST_M_PER_S
+    assert seen.replays() == ""
+
+
 def test_a_second_fault_during_a_guided_stop_is_told_too(tmp_path, oled_profile, oled_machine):
     def strike(stage, backend):
         jump(stage, backend)
