@@ -49,13 +49,28 @@ def _imported_tests(path: Path, root: Path) -> Iterator[Path]:
 
 
 def sources_hash(root: Path = _ROOT) -> str:
-    """Return a hash of everything that a result of the service depends on, the versions of `PACKAGES` with it."""
+    """Return a hash of everything that a result of the service depends on, the versions of `PACKAGES` with it.
+
+    Of Python it is the syntax tree without comments and docstrings: what a sentence says of the code changes no result.
+    """
     digest = hashlib.sha256()
     for path in sources(root):
-        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+        digest.update(str(path.relative_to(root)).encode())
+        digest.update(_code(path.read_text()) if path.suffix == ".py" else path.read_bytes())
     for name in PACKAGES:
         digest.update(f"{name} {metadata.version(name)}".encode())
     return digest.hexdigest()[:16]
+
+
+def _code(text: str) -> bytes:
+    """Return the syntax tree of a Python file, without the places in it, comments and docstrings."""
+    return ast.dump(_WithoutDocstrings().visit(ast.parse(text))).encode()
+
+
+class _WithoutDocstrings(ast.NodeTransformer):
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if text else node
 
 
 def beside_figures(name: str) -> Path:

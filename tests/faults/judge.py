@@ -15,17 +15,18 @@ from where its power went on it is computed how far such a one goes beside this 
 that hears nothing is stopped by its own watch, and detection is what that takes; one whose commands come late does what
 it was told before, which is judged as a motion that nothing has stopped yet.
 
-Rest is |v| < 1 mm/s, also for an axis that loses its power: one that is let go of faster has not come to rest, and
-its way goes on counting. From rest on a drive holds on its encoder. Its loop needs 0.2 s until it stands; that way is
-part of the travel, and no more than 0.2 mm, so no instant is judged by neither bar. An obstacle pushes the macro
-back, against a drive that holds; when it is gone the drive comes back to where its ramp ended, and beyond: a fifth of
-that way, which is the overshoot of its position loop, and by what its integral was wound up to meanwhile. That is at
-most the rest of its greatest force, F / m - w^2 e at e from its goal, and throws it F / (m w^2) - e beyond. All that is
-a spring, no command: only forward travel is judged until the obstacle is gone and the loop stands, by the same bound;
-from there on the macro must stand as after any fault. A drive whose encoder jumps goes with it, there and back, with
-that overshoot: it holds on nothing else. By how much more such an encoder misleads its ramp is no excuse. An end that
-swings, as its motor is too weak to hold it, strikes its stops as long as that lasts: each time an elastic blow of it
-gives the macro a speed, which over the bandwidth of the drive's loop is how far it may go on top.
+Rest is |v| < 1 mm/s, also for an axis that loses its power: one that is let go of faster has not come to rest, and its
+way goes on counting, unless it stood a cycle before (a drive that failed took its power as it stood). From rest on a
+drive holds on its encoder. Its loop needs 0.2 s until it stands; that way is part of the travel, and no more than 0.2
+mm, so no instant is judged by neither bar. An obstacle pushes the macro back, against a drive that holds; when it is
+gone the drive comes back to where its ramp ended, and beyond: a fifth of that way, which is the overshoot of its
+position loop, and by what its integral was wound up to meanwhile. That is at most the rest of its greatest force, F / m
+- w^2 e at e from its goal, and throws it F / (m w^2) - e beyond. All that is a spring, no command: only forward travel
+is judged until the obstacle is gone and the loop stands, by the same bound; from there on the macro must stand as after
+any fault. A drive whose encoder jumps goes with it, there and back, with that overshoot: it holds on nothing else. By
+how much more such an encoder misleads its ramp is no excuse. An end that swings, as its motor is too weak to hold it,
+strikes its stops as long as that lasts: each time an elastic blow of it gives the macro a speed, which over the
+bandwidth of the drive's loop is how far it may go on top.
 
 A motion that no fault stops, or none has stopped yet, is judged in `unstopped.py`; a stop that the operator asked for
 by the same bound with the law's ramp. Where a homing had let go of the macro before anything was noticed, it rolls:

@@ -121,7 +121,7 @@ def test_what_the_journal_leaves_out_is_imported_by_no_process_of_the_service():
 
 
 def test_the_journal_is_of_all_that_its_runs_import():
-    """Asked of Python itself, which follows each import; and of a copy, whose every byte counts."""
+    """Asked of Python itself, which follows each import."""
     parts = ", ".join(f"tests.faults.{name}" for name in ("campaign", "real", "losses", "soak"))
     code = f"import sys, {parts}; print(*(getattr(one, '__file__', None) for one in list(sys.modules.values())))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -131,7 +131,7 @@ def test_the_journal_is_of_all_that_its_runs_import():
     assert imported == {path for path in sources() if path.is_relative_to(ROOT / "tests")}
 
 
-def test_a_byte_of_what_a_run_imports_is_another_journal(tmp_path, monkeypatch):
+def test_a_word_of_code_that_a_run_imports_is_another_journal_and_a_sentence_about_it_is_not(tmp_path, monkeypatch):
     for path in sources():
         copied = tmp_path / path.relative_to(ROOT)
         copied.parent.mkdir(parents=True, exist_ok=True)
@@ -142,8 +142,15 @@ def test_a_byte_of_what_a_run_imports_is_another_journal(tmp_path, monkeypatch):
     for name in ("service/daemon.py", "small_disk.py", "struck_stage.py", "toml_text.py", "faults/judge.py"):
         before = sources_hash(tmp_path)
         with (tmp_path / "tests" / name).open("a") as file:
-            file.write("# one more line\n")
-        assert sources_hash(tmp_path) != before, name
+            file.write("# one more line\n\n\ndef added():\n    pass\n")
+        after = sources_hash(tmp_path)
+        assert after != before, name
+        text = (tmp_path / "tests" / name).read_text()
+        said = text.replace("# one more line", "# another").replace("added():\n", 'added():\n    """Why."""\n')
+        (tmp_path / "tests" / name).write_text(said)
+        assert sources_hash(tmp_path) == after, name
+        (tmp_path / "tests" / name).write_text(said.replace("added():\n", "added(word='x'):\n"))
+        assert sources_hash(tmp_path) != after, name
     before = sources_hash()
     for package in ("numpy", "numba", "python-can"):
         version = metadata.version
