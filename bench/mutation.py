@@ -198,7 +198,8 @@ class _Fields:
         object.__setattr__(self, "row", row)
 
     def __getattr__(self, name: str) -> Any:
-        return self.row[name].item()
+        value = self.row[name]
+        return value if value.ndim else value.item()
 
     def __setattr__(self, name: str, value: Any) -> None:
         self.row[name] = value

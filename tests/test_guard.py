@@ -269,10 +269,32 @@ def test_a_force_that_is_wrong_now_and_then_is_none_that_goes_unheeded(cycle):
     assert Stop.FORCE_UNHEEDED in [cycle.next(macro_reported_force_n=500.0 * (k % 9 == 0)) for k in range(2000)]
 
 
-def test_a_force_that_is_not_told_or_not_asked_for_is_not_judged(oled_profile):
+@pytest.mark.parametrize(("axis", "allowed_n"), [("macro", 100.0), ("micro", 9.0)])
+def test_a_force_may_be_told_for_three_cycles(oled_profile, axis, allowed_n):
     one = Cycle(oled_profile)
-    one.set(macro_reported_force_n=500.0, micro_reported_force_n=100.0)
-    assert [one.next(tpdos_new=k % 2 * 3) for k in range(12)] == [Stop.NONE] * 12
+    word = round(5.0 * allowed_n / oled_profile.axis(axis).torque_step_n)
+
+    def ask(word: int) -> Stop:
+        guard.ask(one.guard[0], *((word, 0) if axis == "macro" else (0, word)))
+        one.guard[f"{axis}_unheeded"] = 0.0
+        return after_many(7, **{f"{axis}_reported_force_n": 5.0 * allowed_n})(one)
+
+    assert [ask(one_word) for one_word in (word, 0, 0, 0)] == [*[Stop.NONE] * 3, Stop.FORCE_UNHEEDED]
+
+
+@pytest.mark.parametrize(("axis", "allowed_n"), [("macro", 100.0), ("micro", 9.0)])
+def test_a_force_beside_what_was_asked_for_by_just_what_is_allowed(cycle, axis, allowed_n):
+    assert after_many(50, **{f"{axis}_reported_force_n": allowed_n})(cycle) is Stop.NONE
+
+
+def test_a_force_that_is_not_told_or_not_asked_for_is_not_judged(oled_profile, single_profile):
+    wrong = {"macro_reported_force_n": 500.0, "micro_reported_force_n": 100.0}
+    for told in ({"tpdos_new": 0}, {"command_lost": 1}):
+        assert after_many(12, **wrong, **told)(Cycle(oled_profile)) is Stop.NONE
+    for heard, axis in ((2, "macro"), (1, "micro")):
+        told = {f"{axis}_reported_force_n": wrong[f"{axis}_reported_force_n"]}
+        assert after_many(12, **told, tpdos_new=heard)(Cycle(oled_profile)) is Stop.NONE
+    assert after_many(100, micro_reported_force_n=100.0)(Cycle(single_profile)) is Stop.NONE
     one = Cycle(with_values(oled_profile, macro__mode="position", macro__encoder_step_m=1e-6))
     assert after_many(100, macro_reported_force_n=500.0)(one) is Stop.NONE
     one = Cycle(with_values(oled_profile, trip__force_error_ratio=1.0))
