@@ -3,7 +3,7 @@
 `--seeds 7` or `13000-13099` plays runs of the batch campaign, with `--part processes` those with real processes, and
 says what was seen of each; `--part NAME` does one part. Without `--full`
 the parts take 15 minutes together on a host of their own: every kind of fault in virtual time, ten runs with real
-processes, every fourth mutant; the last figure says how long they took. With it, an interrupted campaign goes on where
+processes, every sixth mutant; the last figure says how long they took. With it, an interrupted campaign goes on where
 its journal ends.
 """
 
