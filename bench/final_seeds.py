@@ -5,7 +5,6 @@ where it stopped, as long as no source has changed; any other start counts as on
 """
 
 import dataclasses
-import hashlib
 import json
 import subprocess
 import time
@@ -16,27 +15,17 @@ from typing import Any
 from bench.blind_sets import Searched
 from bench.figure import Figure
 from bench.journal import Journal
+from bench.sources import ROOT, gap_hash, gap_sources
 
 FIRST_SEED = 1_001_000  # those from 1_000_000 on were looked at, and the workflow was worked on since
-ROOT = Path(__file__).parent.parent
 RECORD = ROOT / "docs" / "gap-results.json"
-_SOURCES = ("stagectl", "bench", "tests/blind")
-
-
-def sources_digest() -> str:
-    """Return a hash of everything that a result depends on: the workflow, the bench, the generator."""
-    digest = hashlib.sha256()
-    for folder in _SOURCES:
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def commit() -> str:
     """Return the commit, with a mark where the sources differ from it."""
     try:
         name = _git("rev-parse", "HEAD")
-        changed = _git("status", "--porcelain", "--", *_SOURCES)
+        changed = _git("status", "--porcelain", "--", *map(str, gap_sources()))
     except (OSError, subprocess.CalledProcessError):
         return "unknown: no git here"
     return f"{name}, with changes" if changed else name
@@ -89,7 +78,7 @@ class FinalRun:
 
 def begin(record: Path = RECORD) -> FinalRun:
     """Count this run in the record, or go on with one that was cut short on the same sources."""
-    digest = sources_digest()
+    digest = gap_hash()
     content = _read(record)
     for row in content["runs"]:
         journal = _journal(record, row["number"])

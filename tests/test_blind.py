@@ -5,6 +5,7 @@ import json
 import math
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -387,6 +388,39 @@ def test_a_detection_limit_falls_with_the_root_of_the_length():
     # an offset sits at zero frequency: sd = sqrt(S(0) / 2 / T) with S(0) the one-sided density of the coloured force
     density = 0.05**2 / (1.5 * math.pi / (2.0 * math.sqrt(2.0)))
     assert limits[1] == pytest.approx(5.0 * math.sqrt(density / 2.0 / 64.0), rel=0.05)
+
+
+def test_a_stiffness_beside_a_cable_is_a_cable_anchored_elsewhere(touching, monkeypatch):
+    """k x + c (x - x_0) = (k + c) (x - c x_0 / (k + c)): nothing tells the first of them, with x_0 unknown."""
+    monkeypatch.setattr(detection.laws, "LIBRARY", [])
+    cable = draw.Effect(laws.BY_NAME["cable_spring"], "macro_force", {"stiffness_n_per_m": 20.0, "anchor_m": 0.08})
+    spring = draw.Effect(laws.BY_NAME["linear_stiffness"], "macro_force", {"stiffness_n_per_m": 5.0})
+    drag = draw.Effect(laws.BY_NAME["viscous_friction"], "macro_force", {"coefficient_n_s_per_m": 3.0})
+    seen = {}
+    for beside in (cable, drag):
+        case = replace(touching, effects=[spring, beside])
+        case.runs = draw.simulate(case)
+        seen[beside.law.name] = detection.judged(case)[0]
+    assert seen["cable_spring"][0].d_prime < 0.1
+    assert not seen["cable_spring"][0].above_twice
+    assert seen["cable_spring"][1].above_twice  # what it does at its anchor is left
+    assert seen["viscous_friction"][0].d_prime > 20.0
+
+
+def test_a_phase_that_nobody_knows_hides_no_more_than_its_own_pitch(touching):
+    """Two ripples of one pitch, in each homing a sine and a cosine of any size: of the second nothing is left."""
+    case = replace(touching)
+    law, homings = laws.BY_NAME["cogging"], 1 + max(run.homing for run in case.runs)
+    values = {"amplitude_n": 1.0, "pitch_m": 0.03, "second_harmonic": 0.0}
+    case.effects = [
+        draw.Effect(law, "macro_force", values | {"phase_rad": [phase] * homings, "pitch_m": pitch})
+        for phase, pitch in ((0.3, 0.03), (1.2, 0.03), (1.2, 0.02))
+    ]
+    case.runs = draw.simulate(case)
+    evidence = detection.Evidence(case, case.runs)
+    first, second, other = (evidence.free_columns(index) for index in range(3))
+    assert evidence.d_prime(second[0], first) < 0.01 * evidence.d_prime(second[0])
+    assert evidence.d_prime(other[0], first) > 0.5 * evidence.d_prime(other[0])
 
 
 def balance(case, run):

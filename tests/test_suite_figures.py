@@ -2,6 +2,9 @@
 
 import json
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from scipy import stats
 from bench import final_seeds, gap, suite_figures
 from bench.blind_sets import Searched, marked
 from bench.figure import Bar
+from bench.sources import ROOT, gap_sources
 from bench.suite_figures import coverage_figure, judged_estimate, left_out_right, pooled, quantile, share, suite
 
 
@@ -195,6 +199,18 @@ def test_final_seeds_are_counted_before_they_are_run_and_a_run_cut_short_goes_on
     second = final_seeds.begin(record)
     assert second.number == 2
     assert second.kept() == {}
-    monkeypatch.setattr(final_seeds, "sources_digest", lambda: "other")
+    monkeypatch.setattr(final_seeds, "gap_hash", lambda: "other")
     assert final_seeds.begin(record).number == 3
     assert json.loads(record.read_text())["final_seeds_were_run"] == 3
+
+
+def test_a_result_of_the_gap_depends_on_what_it_imports_and_on_nothing_else():
+    code = "import sys, bench.gap; print(*(getattr(one, '__file__', None) for one in list(sys.modules.values())))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    imported = {path for one in done.stdout.split() if (path := Path(one)).is_relative_to(ROOT)}
+    imported = {path for path in imported if path.relative_to(ROOT).parts[0] in ("bench", "stagectl", "tests")}
+    found = set(gap_sources())
+    assert imported <= found  # and what is imported within functions
+    names = {str(path.relative_to(ROOT)) for path in found}
+    assert {"stagectl/gap/selection.py", "stagectl/effects/friction.py", "tests/blind/laws.py"} <= names
+    assert not any(name.startswith(("stagectl/service", "tests/faults", "bench/service")) for name in names)

@@ -177,10 +177,11 @@ def moments(fine_n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (mean, early-weighted mean) of forces on equal parts of each interval, shape (n, parts)."""
     n, parts = fine_n.shape
     mean_n, early_n = np.empty(n), np.empty(n)
+    weights = 2.0 * (1.0 - (np.arange(parts) + 0.5) / parts)
     for k in range(n):
         mean, early = 0.0, 0.0
         for part in range(parts):
             mean += fine_n[k, part]
-            early += 2.0 * (1.0 - (part + 0.5) / parts) * fine_n[k, part]
+            early += weights[part] * fine_n[k, part]
         mean_n[k], early_n[k] = mean / parts, early / parts
     return mean_n, early_n

@@ -479,10 +479,16 @@ class Judge:
         return gained > enough and self._foretells(chosen, [group])
 
     def _inexact(self, chosen: Sequence[Group], whole: float) -> float:
-        """Return what the laws that are chosen may be inexact by where no curve is left, of `whole` that is gained."""
+        """Return what the laws that are chosen may be inexact by where no curve is left, of `whole` that is gained.
+
+        Bristles are as exact as smooth laws there: beside 0.2 to 2.9 million squares of theirs no law of another kind
+        gained more than 8, and a lag of the drive that gained 149 beside 1.4 million was left out.
+        """
         now = self.gain(chosen)
         smooth = sum(
-            now - self.gain([other for other in chosen if other is not group]) for group in chosen if _is_smooth(group)
+            now - self.gain([other for other in chosen if other is not group])
+            for group in chosen
+            if _is_smooth(group) or _is_bristles(group)
         )
         total = whole - self.gain([]) + self.modelled
         return EXACT_RATIO * max(total - smooth, 0.0) + SMOOTH_RATIO * smooth
@@ -692,6 +698,12 @@ def _is_smooth(group: Group) -> bool:
         and not _shows_at_low_speed(group)
         and group.key[1].endswith(("_force", "_actuator"))
     )
+
+
+def _is_bristles(group: Group) -> bool:
+    """Tell whether a law of the library is a friction that remembers how far it was bent."""
+    known = CATALOGUE.get(group.key[0])
+    return known is not None and not known.origin and bool(known.memory) and _shows_at_low_speed(group)
 
 
 def _shows_at_low_speed(group: Group) -> bool:

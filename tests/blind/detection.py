@@ -41,6 +41,9 @@ SIZE_REACH = 4.0  # factor about the nearest size seen, as far as the next start
 SIZE_ROUNDS_ABOUT = 20
 FAR_SHARE = 0.95  # of the whole signal: a law that takes no more of it at any size seen is none that is looked for
 EDGE_LAWS = ("backlash_centre", "backlash_wear")
+SHAPE_FACTORS = ("anchor_m", "asymmetry", "breakaway_ratio", "phase_rad", "second_harmonic", "slope_per_100_mm")
+"""Parameters that, times the amplitude, are a further factor of their law: its force is linear in both."""
+SHAPE_STEP = 1e-3
 NONLINEAR = ("soft_contact", "sensor_delay", "sensor_lag", "command_delay", "current_loop_lag", "amplifier_dead_band")
 
 
@@ -278,6 +281,33 @@ class Evidence:
                 channels[2 + effect.place] = run.errors[index][1:-1]
             channels_of_runs.append(channels)
         return self.whitened(channels_of_runs)
+
+    def free_columns(self, index):
+        """What effect number `index` of the case may do, where nobody knows its size nor any factor of its law.
+
+        A cable beside a linear stiffness is a cable that is anchored elsewhere, to the last bit: with the cable's
+        anchor known, the stiffness seemed to be 77 deviations large.
+        """
+        effect = self.case.effects[index]
+        columns = [self.effect_column(index)]
+        for parameter in effect.law.parameters[1:]:
+            if parameter.name not in SHAPE_FACTORS:
+                continue
+            per = {"phase": "homing", "run_phase": "number"}.get(parameter.spread)
+            moved = [(run, self._moved_channels(run, effect, parameter.name)) for run in self.runs]
+            for group in sorted({getattr(run, per) for run in self.runs}) if per else [None]:
+                own = [what if per is None or getattr(run, per) == group else None for run, what in moved]
+                columns.append(self.whitened(own))
+        return columns
+
+    def _moved_channels(self, run, effect, name):
+        """What a parameter larger by a small step changes in a run."""
+        values = effect.values_in(run)
+        channels = [
+            self.law_channels(run, effect.law, effect.acts_on, values | {name: values[name] + step})
+            for step in (-0.5 * SHAPE_STEP, 0.5 * SHAPE_STEP)
+        ]
+        return [None if low is None else high - low for low, high in zip(*channels, strict=True)]
 
     def _sensor_channels(self, run, place, error):
         """A sensor's error in m enters through the masses, the spring and the stops."""
@@ -603,13 +633,18 @@ def amplitude(effect):
     return abs(effect.values[effect.law.parameters[0].name])
 
 
-def limit_of(case, evidence, index, columns):
+def beside(free, index):
+    """All that the other effects may do: of `free`, columns by effect, all but those of effect `index`."""
+    return [column for i, columns in enumerate(free) if i != index for column in columns]
+
+
+def limit_of(case, evidence, index, free):
     """(d', limit): d' of effect `index` given the others, and the amplitude where it would be 5.
 
     d' isn't proportional to the amplitude where the loop's answer to the effect is itself uncertain, so the case is
     simulated again near the limit, at most three times.
     """
-    own = evidence.d_prime(columns[index], [column for i, column in enumerate(columns) if i != index])
+    own = evidence.d_prime(free[index][0], beside(free, index))
     size = amplitude(case.effects[index])
     if own <= 0.0:
         return 0.0, math.inf
@@ -624,8 +659,8 @@ def limit_of(case, evidence, index, columns):
         if not follows(runs):
             return own, size * scale  # it would be seen long before the loop fails
         other = Evidence(there, runs)
-        marks = [other.effect_column(i) for i in range(len(effects))]
-        probe = other.d_prime(marks[index], [mark for i, mark in enumerate(marks) if i != index])
+        there_free = [other.free_columns(i) for i in range(len(effects))]
+        probe = other.d_prime(there_free[index][0], beside(there_free, index))
         if probe <= 0.0:
             return own, math.inf
     return own, size * scale * D_PRIME_AT_LIMIT / probe
@@ -636,8 +671,8 @@ def judged(case, separate=True):
     if not case.effects and not case.parameter_errors:
         return [], {}
     evidence = Evidence(case, case.runs)
-    columns = [evidence.effect_column(i) for i in range(len(case.effects))]
-    limits = [limit_of(case, evidence, index, columns) for index in range(len(case.effects))]
+    free = [evidence.free_columns(i) for i in range(len(case.effects))]
+    limits = [limit_of(case, evidence, index, free) for index in range(len(case.effects))]
     units = {}
     for key in case.parameter_errors:
         others = [evidence.parameter_column(other) for other in case.parameter_errors if other != key]
@@ -646,15 +681,16 @@ def judged(case, separate=True):
         units[key] = math.sqrt(max(evidence.inner(column, column), 0.0))
     narrow = evidence.narrowed(SEPARATION_BAND_HZ) if separate else evidence
     del evidence
-    columns = [narrow.effect_column(i) for i in range(len(case.effects))] if separate else []
+    free = [narrow.free_columns(i) for i in range(len(case.effects))] if separate else []
     found = []
     for index, (effect, (own, limit)) in enumerate(zip(case.effects, limits, strict=True)):
         nearest = {}
         if separate and amplitude(effect) >= 2.0 * limit:
-            narrow.set_nuisance([column for i, column in enumerate(columns) if i != index])
-            nearest = narrow.distances(columns[index], [] if effect.law.outside else [effect])
+            signal = free[index][0]
+            narrow.set_nuisance(beside(free, index))
+            nearest = narrow.distances(signal, [] if effect.law.outside else [effect])
             if effect.law.name == "asymmetric_coulomb_friction":
-                nearest["coulomb_friction+offset", effect.acts_on] = _coulomb_and_offset(narrow, effect, columns[index])
+                nearest["coulomb_friction+offset", effect.acts_on] = _coulomb_and_offset(narrow, effect, signal)
             nearest.pop((effect.law.name, effect.acts_on), None)
         found.append(_found(own, limit, amplitude(effect), nearest))
     wrong = {}

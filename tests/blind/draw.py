@@ -71,14 +71,18 @@ class Effect:
         return 1 if self.acts_on in ("micro_force", "micro_actuator", "micro_command", "end_sensor") else 0
 
     def vector(self, run):
-        """Parameters in a run."""
+        """Parameters in a run, as the compiled code takes them."""
+        return self.law.vector(self.values_in(run))
+
+    def values_in(self, run):
+        """Parameters in a run, by name."""
         values = dict(self.values)
         for parameter in self.law.parameters:
             if parameter.spread == "phase":
                 values[parameter.name] = self.values[parameter.name][run.homing]
             elif parameter.spread == "run_phase":
                 values[parameter.name] = self.values[parameter.name][run.number]
-        return self.law.vector(values)
+        return values
 
     def scaled(self, factor):
         """The same effect with its amplitude times `factor`."""

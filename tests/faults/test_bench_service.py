@@ -15,10 +15,11 @@ import pytest
 from bench import service, service_batch, service_mutants, service_processes
 from bench.__main__ import main
 from bench.figure import judged
-from bench.journal import APART, Journal, beside_figures, sources, sources_hash
+from bench.journal import Journal, beside_figures
 from bench.mutation import mutants, put, trial, uncompiled
 from bench.service_mutants import MODULES, Scope, equivalent
 from bench.service_processes import COUNT, COUNT_FULL, FULL_LOSS_SEEDS, LOSS_SEEDS
+from bench.sources import APART, service_hash, service_sources
 from stagectl.errors import LinkError
 from stagectl.service import lease, messages
 from stagectl.service.desk import Desk
@@ -106,7 +107,7 @@ def test_an_interrupted_campaign_goes_on_where_its_journal_ends(tmp_path):
 
 
 def test_a_campaigns_journal_is_of_its_sources():
-    assert beside_figures("test") == ROOT / "docs" / "journals" / f"test-{sources_hash()}.jsonl"
+    assert beside_figures("test") == ROOT / "docs" / "journals" / f"test-{service_hash()}.jsonl"
 
 
 def test_what_the_journal_leaves_out_is_imported_by_no_process_of_the_service():
@@ -128,35 +129,35 @@ def test_the_journal_is_of_all_that_its_runs_import():
     imported = {path for one in done.stdout.split() if (path := Path(one)).is_relative_to(ROOT / "tests")}
     names = {str(path.relative_to(ROOT)) for path in imported}
     assert {"tests/service/daemon.py", "tests/small_disk.py", "tests/struck_stage.py", "tests/toml_text.py"} <= names
-    assert imported == {path for path in sources() if path.is_relative_to(ROOT / "tests")}
+    assert imported == {path for path in service_sources() if path.is_relative_to(ROOT / "tests")}
 
 
 def test_a_word_of_code_that_a_run_imports_is_another_journal_and_a_sentence_about_it_is_not(tmp_path, monkeypatch):
-    for path in sources():
+    for path in service_sources():
         copied = tmp_path / path.relative_to(ROOT)
         copied.parent.mkdir(parents=True, exist_ok=True)
         copied.write_bytes(path.read_bytes())
-    assert sources_hash(tmp_path) == sources_hash()
+    assert service_hash(tmp_path) == service_hash()
     (tmp_path / "tests/faults/test_real.py").write_text("assert True\n")  # of which no run knows
-    assert sources_hash(tmp_path) == sources_hash()
+    assert service_hash(tmp_path) == service_hash()
     for name in ("service/daemon.py", "small_disk.py", "struck_stage.py", "toml_text.py", "faults/judge.py"):
-        before = sources_hash(tmp_path)
+        before = service_hash(tmp_path)
         with (tmp_path / "tests" / name).open("a") as file:
             file.write("# one more line\n\n\ndef added():\n    pass\n")
-        after = sources_hash(tmp_path)
+        after = service_hash(tmp_path)
         assert after != before, name
         text = (tmp_path / "tests" / name).read_text()
         said = text.replace("# one more line", "# another").replace("added():\n", 'added():\n    """Why."""\n')
         (tmp_path / "tests" / name).write_text(said)
-        assert sources_hash(tmp_path) == after, name
+        assert service_hash(tmp_path) == after, name
         (tmp_path / "tests" / name).write_text(said.replace("added():\n", "added(word='x'):\n"))
-        assert sources_hash(tmp_path) != after, name
-    before = sources_hash()
+        assert service_hash(tmp_path) != after, name
+    before = service_hash()
     for package in ("numpy", "numba", "python-can"):
         version = metadata.version
         with monkeypatch.context() as patched:
             patched.setattr(metadata, "version", lambda one: "0.1" if one == package else version(one))  # noqa: B023
-            assert sources_hash() != before, package
+            assert service_hash() != before, package
 
 
 def test_a_seed_with_real_processes_is_the_same_run_again_and_all_of_them_are_drawn():

@@ -1,0 +1,91 @@
+"""What a long measurement depends on: its sources as code, comments and docstrings left out, and what computes them."""
+
+import ast
+import hashlib
+from collections.abc import Iterable, Iterator
+from importlib import metadata
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+_RIG_AND_SERVICE = ("stagectl", "drivers", "sim_backend", "profiles")
+_FAULTS = "tests/faults"
+APART = ("stagectl/budget", "stagectl/gap", "stagectl/paper", "stagectl/tuning")
+"""Analysis that no process of the service imports."""
+SERVICE_PACKAGES = ("numba", "numpy", "python-can", "ruckig")
+"""Whose versions count: they compute the motion, or carry its frames."""
+_GAP_ENTRIES = ("bench/gap.py",)
+GAP_PACKAGES = ("numba", "numpy", "scipy")
+
+
+def service_sources(root: Path = ROOT) -> list[Path]:
+    """Return every file below `root` that a result of the service depends on.
+
+    Of the tests: the faults, but no test of them, and what they import, directly or not.
+    """
+    begun = {path for path in (root / _FAULTS).glob("*.py") if not path.name.startswith("test_")}
+    found = _with_imports(begun, root, ("tests",))
+    for name in _RIG_AND_SERVICE:
+        for path in (root / name).rglob("*"):
+            apart = any(path.is_relative_to(root / folder) for folder in APART)
+            if path.suffix in (".py", ".toml", ".eds") and not apart:
+                found.add(path)
+    return sorted(found)
+
+
+def gap_sources(root: Path = ROOT) -> list[Path]:
+    """Return every file below `root` that a result of the gap workflow on blind sets depends on: what it imports."""
+    return sorted(_with_imports({root / name for name in _GAP_ENTRIES}, root, ("bench", "stagectl", "tests")))
+
+
+def service_hash(root: Path = ROOT) -> str:
+    """Return a hash of `service_sources` and of the versions of `SERVICE_PACKAGES`."""
+    return _hash_of(service_sources(root), root, SERVICE_PACKAGES)
+
+
+def gap_hash(root: Path = ROOT) -> str:
+    """Return a hash of `gap_sources` and of the versions of `GAP_PACKAGES`."""
+    return _hash_of(gap_sources(root), root, GAP_PACKAGES)
+
+
+def _with_imports(begun: Iterable[Path], root: Path, folders: tuple[str, ...]) -> set[Path]:
+    """Return these files, and what they import of these folders, directly or not."""
+    found = new = set(begun)
+    while new:
+        new = {path for one in new for path in _imported(one, root, folders)} - found
+        found = found | new
+    return found
+
+
+def _imported(path: Path, root: Path, folders: tuple[str, ...]) -> Iterator[Path]:
+    """Yield the modules of these folders that a file imports, anywhere in it, and the packages that they are in."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom) and node.module is not None and not node.level:
+            names = [node.module, *(f"{node.module}.{one.name}" for one in node.names)]
+        for name in names:
+            parts = name.split(".")
+            if parts[0] in folders:
+                files = [root.joinpath(*parts[:count], "__init__.py") for count in range(1, len(parts) + 1)]
+                yield from (one for one in [*files, root.joinpath(*parts).with_suffix(".py")] if one.is_file())
+
+
+def _hash_of(paths: Iterable[Path], root: Path, packages: Iterable[str]) -> str:
+    """Return a hash of these files and versions; what a sentence says of the code changes no result."""
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(str(path.relative_to(root)).encode())
+        digest.update(_code(path.read_text()) if path.suffix == ".py" else path.read_bytes())
+    for name in packages:
+        digest.update(f"{name} {metadata.version(name)}".encode())
+    return digest.hexdigest()[:16]
+
+
+def _code(text: str) -> bytes:
+    """Return the syntax tree of a Python file, without the places in it, comments and docstrings."""
+    return ast.dump(_WithoutDocstrings().visit(ast.parse(text))).encode()
+
+
+class _WithoutDocstrings(ast.NodeTransformer):
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if text else node
