@@ -11,10 +11,10 @@ _RIG_AND_SERVICE = ("stagectl", "drivers", "sim_backend", "profiles")
 _FAULTS = "tests/faults"
 APART = ("stagectl/budget", "stagectl/gap", "stagectl/paper", "stagectl/tuning")
 """Analysis that no process of the service imports."""
-SERVICE_PACKAGES = ("numba", "numpy", "python-can", "ruckig")
+_SERVICE_PACKAGES = ("numba", "numpy", "python-can", "ruckig")
 """Whose versions count: they compute the motion, or carry its frames."""
-_GAP_ENTRIES = ("bench/gap.py",)
-GAP_PACKAGES = ("numba", "numpy", "scipy")
+_GAP = "bench/gap.py"
+_GAP_PACKAGES = ("numba", "numpy", "scipy")
 
 
 def service_sources(root: Path = ROOT) -> list[Path]:
@@ -34,17 +34,17 @@ def service_sources(root: Path = ROOT) -> list[Path]:
 
 def gap_sources(root: Path = ROOT) -> list[Path]:
     """Return every file below `root` that a result of the gap workflow on blind sets depends on: what it imports."""
-    return sorted(_with_imports({root / name for name in _GAP_ENTRIES}, root, ("bench", "stagectl", "tests")))
+    return sorted(_with_imports({root / _GAP}, root, ("bench", "stagectl", "tests")))
 
 
 def service_hash(root: Path = ROOT) -> str:
-    """Return a hash of `service_sources` and of the versions of `SERVICE_PACKAGES`."""
-    return _hash_of(service_sources(root), root, SERVICE_PACKAGES)
+    """Return a hash of `service_sources` and of the versions of `_SERVICE_PACKAGES`."""
+    return _hash_of(service_sources(root), root, _SERVICE_PACKAGES)
 
 
 def gap_hash(root: Path = ROOT) -> str:
-    """Return a hash of `gap_sources` and of the versions of `GAP_PACKAGES`."""
-    return _hash_of(gap_sources(root), root, GAP_PACKAGES)
+    """Return a hash of `gap_sources` and of the versions of `_GAP_PACKAGES`."""
+    return _hash_of(gap_sources(root), root, _GAP_PACKAGES)
 
 
 def _with_imports(begun: Iterable[Path], root: Path, folders: tuple[str, ...]) -> set[Path]:

@@ -81,6 +81,14 @@ def test_a_spring_about_zero_is_no_cable():
     assert [group.key[0] for group in search.judge.select()] == ["linear_stiffness"]
 
 
+def test_bristles_leave_what_smooth_laws_do():
+    """By 0.05 % of what they gain a lag of a drive beside them was taken for what their law is inexact by."""
+    judge = _search(_bristled(2.0, 1.0, 0.0)).judge
+    (found,) = judge.select()
+    whole = judge.gain([found])
+    assert judge._inexact([found], whole) < 0.1 * EXACT_RATIO * (whole - judge.gain([]))
+
+
 def test_dahls_law_is_found_where_lugres_gains_what_noise_does():
     """Of bristles that hold no more at rest it has three numbers for nothing."""
     search = _search(_bristled(2.0, 1.0, 0.0))
