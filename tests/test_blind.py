@@ -193,7 +193,10 @@ SENSOR = [  # law, parameters, x, error in m at 100 s
     ("thermal_drift", (1e-5, 100.0), 0.0, 1e-5 * (1.0 - E1)),
     ("abbe_error", (1e-5,), -0.05, 2.5e-6),
 ]
-THRUST = [("current_ripple", (0.1, 24e-3, 0.0), 2.2), ("force_constant_saturation", (0.1,), 2.0 - 0.2 * 4e-4)]
+THRUST = [
+    ("current_ripple", (0.1, 24e-3, 0.0), 2.2),
+    ("force_constant_saturation", (0.1,), 2.0 - 0.2 * 4e-4),
+]
 IN_THE_LOOP = {"current_loop_lag", "command_delay", "amplifier_dead_band", "sensor_delay", "sensor_lag", "clock_skew"}
 
 

@@ -50,9 +50,9 @@ def test_dry_friction_never_exceeds_its_level():
 
 
 def test_the_sub_linear_law_is_smooth_at_rest():
-    """Its slope there is F_1 / v_0 (v_0 / v_1)^p = 20 / 1e-4 x (1e-3)^0.63 = 2576 N s/m, not infinite."""
+    """Its slope there is F_1 / v_0 (v_0 / v_1)^p = 20 / 1e-6 x (1e-5)^0.63 = 14159 N s/m, not infinite."""
     law = CATALOGUE["sublinear_viscous_friction"].law
-    assert law(1e-9, 20.0, 0.63) == pytest.approx(-2576.4991e-9, rel=1e-6)
+    assert law(1e-11, 20.0, 0.63) == pytest.approx(-14158.9157e-11, rel=1e-6)
     assert law(0.2, 20.0, 0.5) / law(0.05, 20.0, 0.5) == pytest.approx(2.0, rel=1e-5)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from stagectl.effects import CATALOGUE
+from stagectl.errors import RequestError
 from stagectl.gap import balance, plausibility
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.log import Log
@@ -67,3 +68,29 @@ def test_a_recording_that_bristles_hold_is_not_taken_for_one_in_other_units(slow
     assert one.accelerating
     assert one.factor < most_factor
     plausibility._check_one(recording.believed, one)
+
+
+def test_iron_that_saturates_is_a_missing_effect_and_no_other_machine():
+    """A motor asked for 400 N that gives 107 N does four tenths of what it could; a body of twice the mass, half."""
+    phase = np.sin(2.0 * np.pi * 4.0 * H * np.arange(6000))
+    asked_n = 400.0 * np.sign(phase) * np.sqrt(np.abs(phase)) + np.random.default_rng(3).normal(0.0, 2.0, phase.size)
+    held_n = np.clip(asked_n, -160.0, 160.0)
+    saturated = _recording(_pushed_m(held_n * (1.0 - (held_n / 160.0) ** 2 / 3.0), MASS), asked_n, 2.4e-9)
+    one = plausibility._balance(saturated, "macro")
+    assert one.factor == 1.0
+    assert one.explained_ratio > 0.99
+    plausibility.check_recordings(saturated.believed, [saturated])
+    heavier = _recording(_pushed_m(asked_n, 2.0 * MASS), asked_n, 2.4e-9)
+    with pytest.raises(RequestError, match="profile of another machine"):
+        plausibility.check_recordings(heavier.believed, [heavier])
+
+
+def _pushed_m(force_n: np.ndarray, mass_kg: float) -> np.ndarray:
+    """Return where a body with viscous friction is at samples whose forces are held."""
+    x, v, way_m, steps = 0.0, 0.0, np.zeros(force_n.size), 10
+    for k, push_n in enumerate(force_n):
+        way_m[k] = x
+        for _ in range(steps):
+            v += H / steps * (push_n - 30.0 * v) / mass_kg
+            x += H / steps * v
+    return way_m

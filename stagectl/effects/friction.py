@@ -7,7 +7,9 @@ from stagectl.effects.declaration import effect
 _AXES = ("macro_force", "micro_force")
 _SMOOTHING = (1e-7, 1e-1)  # m/s
 _NAMED_SPEED_M_PER_S = 0.1  # at which the sub-linear law's force is named
-_LEAST_SPEED_M_PER_S = 1e-4  # below it the sub-linear law is linear: its slope at rest would be infinite
+_LEAST_SPEED_M_PER_S = 1e-6
+"""Below it the sub-linear law is linear: its slope at rest would be infinite. From 0.1 mm/s on, what a stage feels in
+reversals of a few micrometres is another law, of which a Stribeck friction at 0.11 mm/s was found to be missing."""
 
 
 @effect(
@@ -97,7 +99,7 @@ def stribeck_friction(velocity_m_per_s, excess_n, stribeck_m_per_s, smoothing_m_
     reference="Waiboer, Aarts, Jonker, ASME DETC 2005: asperity and viscous part of joint friction, power below one",
 )
 def sublinear_viscous_friction(velocity_m_per_s, level_n, exponent_ratio):
-    """Viscous friction with a power p < 1: F = -F_1 |v / v_1|^p sgn v, v_1 = 0.1 m/s, linear below 0.1 mm/s."""
+    """Viscous friction with a power p < 1: F = -F_1 |v / v_1|^p sgn v, v_1 = 0.1 m/s, linear below 1 um/s."""
     speed = np.sqrt(velocity_m_per_s * velocity_m_per_s + _LEAST_SPEED_M_PER_S * _LEAST_SPEED_M_PER_S)
     return -level_n * np.power(speed / _NAMED_SPEED_M_PER_S, exponent_ratio) * (velocity_m_per_s / speed)
 

@@ -130,7 +130,7 @@ def _run(effect: Effect, parameters: list[float], command: np.ndarray, lag_s: fl
     known = {"command_a": command, "t_s": times_s, "dt_s": np.full(command.shape, dt_s)}
     known["current_loop_s"] = np.full(command.shape, lag_s)
     columns = np.column_stack([known[name].ravel() for name in effect.quantities])
-    out = compose.along(effect)(columns, np.array([*parameters, 0.0]), np.zeros(max(effect.memory, 1)))
+    out = compose.along_one_machine(effect)(columns, np.array([*parameters, 0.0]), np.zeros(max(effect.memory, 1)))
     return np.asarray(out).reshape(command.shape)
 
 

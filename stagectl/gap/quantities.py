@@ -144,5 +144,5 @@ def along_motion(effect: Effect, arguments: list[np.ndarray], parameters: list[f
     flat = [np.ascontiguousarray(values).ravel() for values in arguments]
     columns = flat[0][:, None] if len(flat) == 1 else np.column_stack(flat)
     memory = np.zeros(max(effect.memory, 1))
-    out = compose.along(effect)(columns, np.array([*parameters, 0.0]), memory)
+    out = compose.along_one_machine(effect)(columns, np.array([*parameters, 0.0]), memory)
     return np.asarray(out).reshape(arguments[0].shape)

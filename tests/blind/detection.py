@@ -12,11 +12,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from scipy import fft, optimize, stats
 from scipy.interpolate import CubicSpline
 
 from tests.blind import laws, machine
+from tests.blind.compiled import compiled
 from tests.blind.draw import PARAMETER_ERRORS, SENSOR_QUANTUM_M, coloured_power, follows, simulate
 from tests.blind.laws import contact_force, friction_level, is_contact, is_friction, smooth_force, thrust
 from tests.blind.machine import CELLS, SAMPLE_S, STEPS, B
@@ -63,7 +63,7 @@ def second_difference(x):
     return (x[2:] - 2.0 * x[1:-1] + x[:-2]) / SAMPLE_S**2
 
 
-@njit(cache=True)
+@compiled
 def actuator(commands, delay, lag, dead):
     """(mean current over cells, current at samples) of commands in A."""
     n = len(commands)
@@ -77,7 +77,7 @@ def actuator(commands, delay, lag, dead):
     return cells, samples
 
 
-@njit(cache=True)
+@compiled
 def along(code, place, p, cells, mass1, mass2, start, t0, contact):
     """Force (2, cells) of a law along a recorded motion; dry friction has the direction that the record shows."""
     n = cells.shape[0]
@@ -557,7 +557,7 @@ def _products(a, b):
     return np.einsum("ik,jk->ij", a, b)
 
 
-@njit(cache=True)
+@compiled
 def _stops(r, speed, contact):
     """Force in N of the stops on the macro axis at relative positions and speeds, the mean over each cell."""
     out = np.zeros(len(r))
@@ -566,7 +566,7 @@ def _stops(r, speed, contact):
     return out
 
 
-@njit(cache=True)
+@compiled
 def _stop(r, i, speed, contact):
     """The same of cell `i`.
 
@@ -589,7 +589,7 @@ def _stop(r, i, speed, contact):
     return contact_force(-1, np.zeros(laws.PARAMETERS), np.zeros(laws.MEMORIES), 0.0, 0.0, r[i], speed, contact)
 
 
-@njit(cache=True)
+@compiled
 def _thrust_along(code, p, constant, currents, x):
     out = np.zeros(len(x))
     for i in range(len(x)):
@@ -597,7 +597,7 @@ def _thrust_along(code, p, constant, currents, x):
     return out
 
 
-@njit(cache=True)
+@compiled
 def _reading_errors(code, p, t0, x):
     out = np.zeros(len(x))
     for i in range(len(x)):
@@ -605,7 +605,7 @@ def _reading_errors(code, p, t0, x):
     return out
 
 
-@njit(cache=True)
+@compiled
 def _lagged(fine, lag):
     out = np.zeros(len(fine))
     out[0] = fine[0]

@@ -7,7 +7,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
+
+from tests.blind.compiled import compiled
 
 GRAVITY_M_PER_S2 = 9.80665
 REFERENCE_LENGTH_M = 0.1  # lengths and speeds at which position and speed laws state their amplitude
@@ -381,7 +382,7 @@ SINCE_REVERSAL, ROOT_PERIODIC, ONE_WAY, DEAD_ZONE, ACCELERATION_SIGN = 101, 102,
 VELOCITY_PERIODIC, RINGING, SPEED_SINE, LAST_REVERSAL, BUMPS = 106, 107, 108, 109, 110
 
 
-@njit(cache=True)
+@compiled
 def _turn(mem, v, x, dt):
     """mem: [direction, time since the last reversal, place of it]; a reversal needs 0.2 mm/s the other way."""
     if dt > 0.0:
@@ -390,7 +391,7 @@ def _turn(mem, v, x, dt):
             mem[0], mem[1], mem[2] = math.copysign(1.0, v), 0.0, x
 
 
-@njit(cache=True)
+@compiled
 def smooth_force(code, p, mem, dt, t, x, v, other, mass):
     """Force in N on an axis at x, v; `other`: the other axis's drive force.
 
@@ -487,7 +488,7 @@ def smooth_force(code, p, mem, dt, t, x, v, other, mass):
     return 0.0
 
 
-@njit(cache=True)
+@compiled
 def friction_level(code, p, mem, dt, x, v, drive, direction):
     """Level in N (>= 0) of a dry friction for motion in `direction` (+1, -1); at rest it holds up to this level."""
     if code == COULOMB:
@@ -508,19 +509,19 @@ def friction_level(code, p, mem, dt, x, v, drive, direction):
     return 0.0
 
 
-@njit(cache=True)
+@compiled
 def is_friction(code):
     """Dry friction: set-valued at rest."""
     return 3 <= code <= 4 or 6 <= code <= 7 or code == 10 or code == 21 or code == 101
 
 
-@njit(cache=True)
+@compiled
 def is_contact(code):
     """Acts between the stages."""
     return 22 <= code <= 26 or code == 40
 
 
-@njit(cache=True)
+@compiled
 def contact_force(code, p, mem, dt, t, r, speed, contact):
     """Force in N of the stops on the macro (its opposite on the end stage).
 
@@ -560,18 +561,20 @@ def contact_force(code, p, mem, dt, t, r, speed, contact):
     return between + side * max(0.0, spring + damping * inward)
 
 
-@njit(cache=True)
+@compiled
 def thrust(code, p, constant, current, x):
     """Drive force in N of a current in A."""
     force = constant * current
     if code == RIPPLE:
         force *= 1.0 + p[0] * math.sin(2.0 * math.pi * x / p[1] + p[2])
     elif code == SATURATION:
-        force *= max(0.3, 1.0 - p[0] * (force / REFERENCE_FORCE_N) ** 2)
+        peak = REFERENCE_FORCE_N / math.sqrt(3.0 * p[0])  # beyond it more current would bring less force: iron does not
+        force = min(max(force, -peak), peak)
+        force *= 1.0 - p[0] * (force / REFERENCE_FORCE_N) ** 2
     return force
 
 
-@njit(cache=True)
+@compiled
 def dead_zone(width, asked):
     """A command in A through a dead zone: nothing below `width`, less by `width` above."""
     if asked > width:
@@ -581,7 +584,7 @@ def dead_zone(width, asked):
     return 0.0
 
 
-@njit(cache=True)
+@compiled
 def reading_error(code, p, t, x):
     """What a sensor adds to a position x in m: the laws without memory."""
     if code == SCALE:

@@ -7,9 +7,9 @@ axis and never turn it; currents exactly through their first-order loops. 50 us 
 import math
 
 import numpy as np
-from numba import njit
 
 from tests.blind import laws
+from tests.blind.compiled import compiled
 from tests.blind.laws import contact_force, dead_zone, friction_level, is_contact, is_friction, smooth_force, thrust
 
 SAMPLE_S = 1e-3
@@ -62,7 +62,7 @@ C = {name: i for i, name in enumerate(CONTROL)}
 CONTROL_STATE = 6  # macro: last reading, filtered speed, integral; micro: the same
 
 
-@njit(cache=True)
+@compiled
 def axis_law(gains, state, at, reference, speed, reading, first):
     """Cascaded position and velocity loop: force in N before feed-forward. `at` is its first state."""
     kp, kv, ki, filter_hz = gains[0], gains[1], gains[2], gains[3]
@@ -76,7 +76,7 @@ def axis_law(gains, state, at, reference, speed, reading, first):
     return kv * (miss + state[at + 2])
 
 
-@njit(cache=True)
+@compiled
 def control(c, state, reference, relative, y1, y2, first, single):
     """Commands (macro, micro) in N. reference: position, speed, acceleration; relative: of end minus macro."""
     u2 = 0.0
@@ -91,7 +91,7 @@ def control(c, state, reference, relative, y1, y2, first, single):
     return u1, u2
 
 
-@njit(cache=True)
+@compiled
 def loop_step(current, commands, k, s, delay, lag, dead):
     """A current loop over one step from s after sample k: (current at its end, its mean)."""
     i0 = k + math.floor((s - delay) / SAMPLE_S + 1e-9)
@@ -110,7 +110,7 @@ def loop_step(current, commands, k, s, delay, lag, dead):
     return new + (middle - new) * e, total / STEP_S
 
 
-@njit(cache=True)
+@compiled
 def at_time(fine, start, filled, t):
     """Position at a time t >= 0 from the fine record, between its points on a line; before the start it stands."""
     place = t / STEP_S
@@ -122,7 +122,7 @@ def at_time(fine, start, filled, t):
     return fine[i] + (place - i) * (fine[i + 1] - fine[i])
 
 
-@njit(cache=True)
+@compiled
 def simulate(base, payload, single, c, reference, relative, coloured, noise, t0, codes, places, p):
     """One run of the closed loop.
 
