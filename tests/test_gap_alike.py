@@ -81,6 +81,15 @@ def test_a_spring_about_zero_is_no_cable():
     assert [group.key[0] for group in search.judge.select()] == ["linear_stiffness"]
 
 
+def test_an_offset_is_no_cable_from_ten_metres_away():
+    """A constant force, but for a hundredth: a set with a cable in it asks for a move that could split nothing."""
+    search = _search(lambda: lambda command_n, x, v: command_n - 3.0)
+    (found,) = search.judge.select()
+    assert found.key[0] == "offset"
+    assert "cable_spring" in {group.key[0] for group in search.judge.rivals([])}
+    assert [key[0] for key, _ in search.judge.aliases([found], found)] == ["gravity_tilt"]
+
+
 def test_bristles_leave_what_smooth_laws_do():
     """By 0.05 % of what they gain a lag of a drive beside them was taken for what their law is inexact by."""
     judge = _search(_bristled(2.0, 1.0, 0.0)).judge

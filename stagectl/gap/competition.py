@@ -16,7 +16,7 @@ from stagectl.gap.noise import Explained
 from stagectl.gap.normal_equations import Group, Sums, solve
 from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
-from stagectl.gap.refinement import Refiner, but_for_size, counts_at_size, gain_at_size, refined
+from stagectl.gap.refinement import Refiner, but_for_size, counts_at_size, gain_at_size, nearest_place, refined
 from stagectl.gap.selection import Judge
 
 _EXCITED_GAIN = 1e-6
@@ -72,6 +72,7 @@ class Competition:
         self._refiner: tuple[tuple[int, ...], Refiner] | None = None
         self.judge = Judge(evidence, training_count, base, library, self._refined, self._gains_at_size)
         self.judge.curves = self.curves
+        self.judge.brought_near = self._brought_near
         self.judge.modelled = self._modelled()
         self.judge.is_rough = any(level.white_force_n > 0.0 for level in noise.values())
 
@@ -133,6 +134,16 @@ class Competition:
         gains = self._crew.map(gain_at_size, (self.evidence, self._beside(beside)), terms.values())
         found = dict(zip(terms, gains, strict=True))
         return [found[asked[group.columns]] if group.columns in asked else 0.0 for group in groups]
+
+    def _brought_near(self, group: Group) -> Group:
+        """Return a law that acts about a place no farther from the travel than the grid has it beside it."""
+        term = self.term(group)
+        near = nearest_place(self.evidence.recordings, term)
+        if near is term:
+            return group
+        (columns,) = self._crew.here(self.evidence.columns_of, [near])
+        (found,) = self.evidence.append_all([Added(near, columns, group.prior_sds, group.searched)])
+        return found
 
     def term(self, group: Group) -> Term:
         """Return what a group stands for."""

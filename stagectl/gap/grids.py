@@ -25,11 +25,26 @@ _ANCHORS = (0.0, 0.5, -0.5, 1.5, -1.5, 5.0, -5.0)
 plane of pull at rest and stiffness. From the middle alone one that was anchored beside the travel did not rank: 32 000
 squares of 115 000, and the offset that it mostly is 105 000."""
 
+_BESIDE = 1.5  # of half the travel from its middle: as far as what acts about a place is still said to do so
+
 _LASER_M = 632.8e-9
 
 _SLOPE_S = 1e-8
 """Delay that stands for a slope over delays: at 0.2 m/s it moves an edge by 2 nm. 10 us move it by 2 um, and beside a
 lag of the other sensor, which is a slope, a delay of 249 us gained 1 square in place of 1466."""
+
+
+def _recorded_travel_m(recordings: Sequence[Recording]) -> tuple[float, float]:
+    """Return middle and half of the macro's travel."""
+    centre_m = float(np.mean([0.5 * (r.log.macro_position_m.max() + r.log.macro_position_m.min()) for r in recordings]))
+    return centre_m, 0.5 * max(float(np.ptp(r.log.macro_position_m)) for r in recordings)
+
+
+def near_travel_m(recordings: Sequence[Recording]) -> tuple[float, float]:
+    """Return from where to where a law may act that acts about a place beside the travel: half as far again."""
+    centre_m, half_m = _recorded_travel_m(recordings)
+    reach_m = _BESIDE * max(half_m, 0.5 * recordings[0].believed.travel_m)
+    return centre_m - reach_m, centre_m + reach_m
 
 
 def free_shapes(known: Effect) -> tuple[str, ...]:
@@ -42,9 +57,8 @@ Grid = dict[str, list[dict[str, float]]]
 
 def grids_for(recordings: Sequence[Recording]) -> Grid:
     """Return, by effect, the shapes to try on these recordings."""
-    centre_m = float(np.mean([0.5 * (r.log.macro_position_m.max() + r.log.macro_position_m.min()) for r in recordings]))
+    centre_m, half_m = _recorded_travel_m(recordings)
     smooth = [{"smoothing_m_per_s": v} for v in _SMOOTHINGS_M_PER_S]
-    half_m = 0.5 * max(float(np.ptp(r.log.macro_position_m)) for r in recordings)
     library = {
         "coulomb_friction": smooth,
         "asymmetric_coulomb_friction": smooth,

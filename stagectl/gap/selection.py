@@ -111,6 +111,8 @@ class Judge:
     library: list[Group]
     refine: Refine
     gains_at_size: GainsAtSize
+    brought_near: Callable[[Group], Group] = lambda group: group
+    """A law that acts about a place far from the travel -> the same at the nearest place beside it; others as they are."""
     curves: list[Group] = field(default_factory=list)
     threshold: float = 0.0
     modelled: float = (
@@ -569,14 +571,18 @@ class Judge:
         return chosen
 
     def aliases(self, chosen: Sequence[Group], group: Group) -> list[tuple[tuple[str, str], float]]:
-        """Return the keys that would do as well as `group` beside the others, with the margin that they lose by."""
+        """Return the keys that would do as well as `group` beside the others, with the margin that they lose by.
+
+        What acts about a place does so from near the travel: anchored ten metres away, a cable is an offset, whose set
+        it was named in.
+        """
         rest = [other for other in chosen if other is not group]
         with_it = self.gain(chosen)
         gained = with_it - self.gain(rest)
         left = self._left_at_most(chosen)
         margins: dict[tuple[str, str], float] = {}
         taken = {other.key for other in chosen}
-        for other in self.rivals(rest):
+        for other in map(self.brought_near, self.rivals(rest)):
             if other.key in taken or _form(other) > _form(group) or not self._allowed([*rest, other]):
                 continue
             margin = with_it - self.gain([*rest, other])
