@@ -112,7 +112,7 @@ class Judge:
     refine: Refine
     gains_at_size: GainsAtSize
     brought_near: Callable[[Group], Group] = lambda group: group
-    """A law that acts about a place far from the travel -> the same at the nearest place beside it; others as they are."""
+    """A law that acts about a place far from the travel -> the same at the nearest one beside it; others stay."""
     curves: list[Group] = field(default_factory=list)
     threshold: float = 0.0
     modelled: float = (
