@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance
 from stagectl.gap.believed import Believed, BelievedAxis
-from stagectl.gap.command_path import PARTS_COUNT, behind, changed_by, driven
+from stagectl.gap.command_path import PARTS_COUNT, behind, changed_by, driven, driven_later
+from stagectl.gap.effect_forces import known_forces
 from stagectl.gap.hypotheses import deviation_term, parameter_terms
 from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
@@ -57,6 +59,29 @@ def test_a_lag_behind_the_current_loop_by_partial_fractions(latch_s, lag_s, cons
     assert near([part[100:] for part in found], [part[100:] for part in wanted], 1e-3)
 
 
+@pytest.mark.parametrize(("latch_s", "lag_s"), DRIVES)
+@pytest.mark.parametrize("late_s", [0.0, 97e-6, 1.3e-3])
+def test_what_comes_later_by_as_much_is_a_later_latch(latch_s, lag_s, late_s):
+    edges = COMMAND.size * PARTS_COUNT + 1
+    found = driven_later(COMMAND, latch_s, lag_s, PERIOD_S, np.full(edges, late_s))
+    wanted, _ = driven(COMMAND, latch_s + late_s, lag_s, PERIOD_S)
+    assert np.abs(found - wanted)[30:-30].max() < 1e-9 * STEP
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.1e-3])
+def test_what_comes_ever_later_is_read_off_the_same_current_at_those_instants(lag_s):
+    """Against the current on a grid of a thousandth of an interval, 0.2 % later with every second that goes by."""
+    latch_s, rate, fine = 0.57e-3, 2e-3, 1000
+    command, t_s = COMMAND[:60], (np.arange(60 * fine) + 0.5) * PERIOD_S / fine
+    goal = command[np.clip(np.floor((t_s - latch_s) / PERIOD_S).astype(int), 0, None)]
+    keeps = np.exp(-PERIOD_S / fine / lag_s) if lag_s else 0.0
+    current = lfilter([1.0 - keeps], [1.0, -keeps], goal, zi=[keeps * goal[0]])[0]
+    wanted = np.interp(t_s - rate * t_s, t_s, current).reshape(60, PARTS_COUNT, -1).mean(axis=2)
+    edges_s = np.arange(60 * PARTS_COUNT + 1) * PERIOD_S / PARTS_COUNT
+    found = driven_later(command, latch_s, lag_s, PERIOD_S, rate * edges_s)
+    assert np.abs(found - wanted)[:-1].max() < 5e-3 * STEP
+
+
 def test_a_dead_band_changes_the_commands_themselves():
     commands = np.where(np.abs(COMMAND) < 2.0, 0.0, COMMAND - np.sign(COMMAND) * 2.0)
     before = driven(COMMAND, 0.57e-3, 0.15e-3, PERIOD_S)
@@ -94,6 +119,23 @@ def test_a_delay_that_is_known_is_in_the_currents_that_a_drive_should_report(und
         left.append(np.abs(balance.observed(recording)[-1][30:-30]).max())
     assert left[0] > 1.0
     assert left[1] < 1e-3 * left[0]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_is_known_of_a_drive_is_felt_as_late_as_its_body_is_read(order):
+    """Left where it was beside a clock of 16 ppm, a dead band of 45 mA drew a flexible mode and a current ripple."""
+    width_a = 0.02
+    log = Log("run", PERIOD_S, 1e-4 * np.sin(np.arange(COMMAND.size) / 20.0), COMMAND, np.ones(COMMAND.size, bool), "1")
+    moved = [
+        (CATALOGUE["amplifier_dead_band"], "macro_command", {"half_width_a": width_a}),
+        (CATALOGUE["sensor_delay"], "macro_sensor", {"delay_s": DELAY_S}),
+    ]
+    there = operating_point(balance.recording_of(log, AXIS), moved[::order])
+    width_n = width_a * CONSTANT_N_PER_A
+    less = np.sign(COMMAND) * np.minimum(np.abs(COMMAND), width_n)
+    wanted, _ = driven(COMMAND - less, LATCH_S + DELAY_S, LAG_S, PERIOD_S)
+    assert np.abs(there.felt_n["macro"] - wanted)[30:-30].max() < 1e-9 * STEP
+    assert np.abs(known_forces(there).macro_n - wanted)[30:-30].max() < 1e-9 * STEP
 
 
 def test_beside_a_delay_that_is_known_the_latch_is_the_same_column(under_a_delay):

@@ -4,12 +4,11 @@ import numpy as np
 
 from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import late_readings
-from stagectl.gap.command_path import changed_by
 from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
 from stagectl.gap.late_readings import makes_late
 from stagectl.gap.quantities import along_motion, arguments_of, quantities
 from stagectl.gap.reading_errors import SMALL_M, misread, more_contact_n, reading_error_m
-from stagectl.gap.recording import Recording, contact_push_n, relative_motion, with_late
+from stagectl.gap.recording import Recording, contact_push_n, driven_by, relative_motion, with_late
 
 
 def known_forces(recording: Recording, but: Trait | None = None) -> Forces:
@@ -19,7 +18,7 @@ def known_forces(recording: Recording, but: Trait | None = None) -> Forces:
         add_forces(total, between(recording, joint_force_n(recording)))
     for row in (*recording.believed.effects, *recording.at_size):
         effect = CATALOGUE[row["name"]]
-        if but in effect.traits:
+        if but in effect.traits or row["acts_on"].endswith("_command"):  # motors feel these already
             continue
         add_forces(total, effect_forces(recording, effect, row["acts_on"], [row[name] for name in effect.parameters]))
     return total
@@ -149,15 +148,12 @@ def _contact_changed(recording: Recording, pressing_n: np.ndarray, whole: bool) 
 
 def _commanded(recording: Recording, axis: str, effect: Effect, parameters: list[float]) -> Forces:
     """Return what an effect of the command path changes of one motor's force and reported current."""
-    command_n = recording.log.macro_command_n if axis == "macro" else recording.log.micro_command_n
-    if command_n is None:
+    if axis not in recording.axes:
         return Forces()
-    belief = recording.belief(axis)
-    command_a = command_n / belief.force_constant_n_per_a
-    added_a, at_a = changed_by(
-        effect, parameters, command_a, belief.latch_s, belief.current_loop_s, recording.log.period_s
-    )
-    return motor_forces(recording, axis, added_a * belief.force_constant_n_per_a, at_a)
+    drive = recording.belief(axis)
+    now, then = (driven_by(recording, axis, acting, drive) for acting in ([], [(effect, parameters)]))
+    motor_n, at_n = (after - before for before, after in zip(now, then, strict=True))
+    return motor_forces(recording, axis, motor_n, at_n / drive.force_constant_n_per_a)
 
 
 def motor_forces(recording: Recording, axis: str, force_n: np.ndarray, current_a: np.ndarray | None) -> Forces:

@@ -5,19 +5,17 @@ Pure.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from stagectl.effects import CATALOGUE, Effect, Trait
-from stagectl.gap import late_readings
-from stagectl.gap.command_path import changed_by, driven
 from stagectl.gap.effect_forces import between, effect_forces, known_forces, motor_forces
 from stagectl.gap.forces import Forces, add_forces, scaled_forces
 from stagectl.gap.quantities import quantities
 from stagectl.gap.reading_errors import SMALL_M, more_contact_n
-from stagectl.gap.recording import Recording, relative_motion
+from stagectl.gap.recording import Recording, acting_on, driven_by, relative_motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +107,9 @@ def _motor(axis: str, r: Recording) -> list[Forces]:
     if axis not in r.felt_n:
         return [Forces()]
     total = motor_forces(r, axis, r.felt_n[axis], None)
-    side = "macro" if axis == "macro" else "micro"
-    for row in (*r.believed.effects, *r.at_size):
-        if row["acts_on"] in (f"{side}_command", f"{side}_actuator"):
+    place = "macro_actuator" if axis == "macro" else "micro_actuator"
+    for row in r.believed.effects:
+        if row["acts_on"] == place:
             effect = CATALOGUE[row["name"]]
             values = [row[name] for name in effect.parameters]
             add_forces(total, effect_forces(r, effect, row["acts_on"], values))
@@ -206,36 +204,13 @@ def _timing(axis: str, lag_s: float, r: Recording) -> list[Forces]:
     Effects of the command path that are known come later with it: beside a delay of 350 us that was left out here, a
     latch of 6 us was known to 1 us, and the delay to 5 us where it was 13 us off.
     """
-    belief = r.belief(axis)
-    command_n = r.log.macro_command_n if axis == "macro" else r.log.micro_command_n
-    if command_n is None:
+    if axis not in r.axes:
         return [Forces()]
-    latch_s, loop_s = belief.latch_s, belief.current_loop_s
-    step_s = _TIMING_STEP_S
-    now = _driven_under(r, axis, command_n, latch_s, loop_s)
-    later = _driven_under(r, axis, command_n, latch_s + (0.0 if lag_s else step_s), loop_s + (step_s if lag_s else 0.0))
+    drive, acting, step_s = r.belief(axis), acting_on(axis, r.believed, r.at_size), _TIMING_STEP_S
+    changed = replace(drive, current_loop_s=lag_s + step_s) if lag_s else replace(drive, latch_s=drive.latch_s + step_s)
+    now, later = (driven_by(r, axis, acting, one) for one in (drive, changed))
     slope, slope_at = ((after - before) / step_s for before, after in zip(now, later, strict=True))
-    return [motor_forces(r, axis, slope, slope_at / belief.force_constant_n_per_a)]
-
-
-def _driven_under(
-    r: Recording, axis: str, command_n: np.ndarray, latch_s: float, lag_s: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a drive with all known effects of its command path makes of commands, N, as `driven` has it."""
-    h, constant = r.log.period_s, r.belief(axis).force_constant_n_per_a
-    _, at_samples_n = driven(command_n, latch_s, lag_s, h)
-    means_n = late_readings.motor_n(r.late, axis, r.log, command_n, latch_s, lag_s)
-    late_s = float(np.mean(late_readings.delay_s(r.late, axis, r.log)))
-    place = "macro_command" if axis == "macro" else "micro_command"
-    for row in (*r.believed.effects, *r.at_size):
-        if row["acts_on"] == place:
-            effect = CATALOGUE[row["name"]]
-            values = [row[name] for name in effect.parameters]
-            added_a, at_a = changed_by(effect, values, command_n / constant, latch_s, lag_s, h)
-            if late_s:
-                added_a, _ = changed_by(effect, values, command_n / constant, latch_s + late_s, lag_s, h)
-            means_n, at_samples_n = means_n + constant * added_a, at_samples_n + constant * at_a
-    return means_n, at_samples_n
+    return [motor_forces(r, axis, slope, slope_at / drive.force_constant_n_per_a)]
 
 
 def _joint(r: Recording, force_on_end_n: np.ndarray) -> list[Forces]:

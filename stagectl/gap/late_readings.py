@@ -9,7 +9,7 @@ tell a late sensor from a late motor, which it can't. Bodies meet at one instant
 moved there. Pure.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,18 @@ import numpy as np
 from stagectl import compose
 from stagectl.compiled import compiled
 from stagectl.effects import CATALOGUE, Effect, Trait
-from stagectl.gap.command_path import PARTS_COUNT, behind, driven, lagged
+from stagectl.gap.believed import BelievedAxis
+from stagectl.gap.command_path import (
+    PARTS_COUNT,
+    Acting,
+    at_delays,
+    at_once,
+    behind,
+    changed_by,
+    driven,
+    driven_later,
+    lagged,
+)
 from stagectl.gap.log import Log
 from stagectl.gap.motion import Motion
 
@@ -56,49 +67,51 @@ def _late_s(effect: Effect, parameters: list[float], t_s: np.ndarray) -> np.ndar
 
 def delay_s(rows: Sequence[Row], axis: str, log: Log) -> np.ndarray:
     """Return the dead time of one body's readings at every sample, shape (n,); lags are none."""
-    times_s = log.start_s + log.times_s
-    total = np.zeros(times_s.size)
-    for effect, parameters, is_lag in _of(rows, axis):
-        if not is_lag:
-            total += _late_s(effect, parameters, times_s)
-    return total
+    return _delays_s(rows, axis, log.start_s + log.times_s)
+
+
+def _delays_s(rows: Sequence[Row], axis: str, t_s: np.ndarray) -> np.ndarray:
+    delays = [_late_s(effect, parameters, t_s) for effect, parameters, is_lag in _of(rows, axis) if not is_lag]
+    return np.sum(delays, axis=0) if delays else np.zeros(t_s.size)
 
 
 def motor_n(
-    rows: Sequence[Row], axis: str, log: Log, command_n: np.ndarray, latch_s: float, loop_s: float
+    rows: Sequence[Row],
+    axis: str,
+    log: Log,
+    acting: Sequence[Acting],
+    command_n: np.ndarray,
+    drive: BelievedAxis,
 ) -> np.ndarray:
-    """Return what a late body feels of a motor, exactly, on parts of its intervals, shape (n, parts)."""
+    """Return what a late body feels of its motor, on parts of its intervals, shape (n, parts).
+
+    acting: effects of the drive's command path. Exactly; what has a memory and comes ever later goes by `at_delays`,
+    and what has one behind a lag of the sensor is smeared over parts.
+    """
+    h, late_s = log.period_s, delay_s(rows, axis, log)
     lags_s = [parameters[0] for _, parameters, is_lag in _of(rows, axis) if is_lag]
-    h = log.period_s
+    loop_s, constant = drive.current_loop_s, drive.force_constant_n_per_a
+    changed_n, slow = at_once(acting, command_n, constant, h)
 
     def made(latch_s: float) -> np.ndarray:
-        total_n, _ = driven(command_n, latch_s, loop_s, h)
+        total_n = np.zeros((late_s.size, PARTS_COUNT))
         for lag_s in lags_s:
-            total_n = total_n + behind(lag_s, command_n, latch_s, loop_s, h)[0]
+            total_n += behind(lag_s, changed_n, latch_s, loop_s, h)[0]
+        for effect, parameters in slow:
+            added_n = constant * changed_by(effect, parameters, command_n / constant, latch_s, loop_s, h)[0]
+            for lag_s in lags_s:
+                added_n = lagged(added_n, lag_s, h)[0]
+            total_n += added_n
         return total_n
 
-    return _at_delays(made, latch_s, delay_s(rows, axis, log), h)
-
-
-def _at_delays(made: Callable[[float], np.ndarray], latch_s: float, late_s: np.ndarray, period_s: float) -> np.ndarray:
-    """Return `made` of a latch that is later by what each interval has, on that interval.
-
-    While a step moves within one part the mean over it changes in proportion: between latches at the parts' borders a
-    straight line is exact.
-    """
     if np.ptp(late_s) == 0.0:
-        return made(latch_s + float(late_s[0]))
-    part_s = period_s / PARTS_COUNT
-    at = (latch_s + late_s) / part_s
-    low = np.floor(at).astype(int)
-    share = at - low
-    out = np.zeros((late_s.size, PARTS_COUNT))
-    for node in range(int(low.min()), int(low.max()) + 2):
-        weight = np.where(low == node, 1.0 - share, 0.0) + np.where(low + 1 == node, share, 0.0)
-        here = weight > 0.0
-        if np.any(here):
-            out[here] += weight[here, None] * made(node * part_s)[here]
-    return out * (1.0 - np.gradient(late_s, period_s))[:, None] ** 2
+        latch_s = drive.latch_s + float(late_s[0])
+        return driven(changed_n, latch_s, loop_s, h)[0] + made(latch_s)
+    edges_s = log.start_s + h / PARTS_COUNT * np.arange(late_s.size * PARTS_COUNT + 1)
+    total_n = driven_later(changed_n, drive.latch_s, loop_s, h, _delays_s(rows, axis, edges_s))
+    if lags_s or slow:
+        total_n += at_delays(made, drive.latch_s, late_s, h)
+    return total_n * (1.0 - np.gradient(late_s, h))[:, None] ** 2
 
 
 def felt_n(rows: Sequence[Row], axis: str, log: Log, force_n: np.ndarray) -> np.ndarray:

@@ -220,9 +220,9 @@ def _pushed_rest_n(recording: Recording, axis: str, columns: np.ndarray, inertia
 
     While both move together that looks like a macro as heavy as both: a missing effect, and no other machine.
     """
-    if axis != "macro" or recording.micro_command_n is None:
+    if axis != "macro" or recording.micro_motor_n is None:
         return None
-    back_n = -in_band(recording.micro_command_n.mean(axis=1), recording.log.period_s)
+    back_n = -in_band(recording.micro_motor_n.mean(axis=1), recording.log.period_s)
     beside = np.column_stack([back_n, columns[:, 1:]])
     unit = np.sqrt(np.mean(beside**2, axis=0)) + 1e-300
     shares = np.linalg.lstsq(beside / unit, inertia_n - columns[:, 0], rcond=1e-10)[0]

@@ -65,7 +65,7 @@ def _made(recording: Recording, axis: str, kind: str) -> dict[str, Callable[[], 
         middles_s = (np.arange(PARTS_COUNT) + 0.5)[None, :] / PARTS_COUNT * h
         return recording.log.start_s + recording.log.times_s[:, None] + middles_s
 
-    motor_n, micro_n = recording.felt_n[axis], recording.micro_command_n
+    motor_n, micro_n = recording.felt_n[axis], recording.micro_motor_n
     made: dict[str, Callable[[], np.ndarray]] = {
         "position_m": lambda: apart(0) if kind == "joint" else motion.position_m,
         "velocity_m_per_s": lambda: apart(1) if kind == "joint" else motion.velocity_m_per_s,

@@ -1,12 +1,14 @@
 """One log with all that does not depend on a hypothesis: motion, motor forces, where the joint touches. Pure."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from stagectl.effects import CATALOGUE
 from stagectl.gap import late_readings
 from stagectl.gap.believed import Believed, BelievedAxis
-from stagectl.gap.command_path import driven
+from stagectl.gap.command_path import Acting, made_by
 from stagectl.gap.contact import Contact, contact_at, contact_damping_n_s_per_m
 from stagectl.gap.forces import Forces
 from stagectl.gap.innovations import Noise
@@ -29,8 +31,8 @@ class Recording:
     believed: Believed
     macro: Motion
     end: Motion | None
-    macro_command_n: np.ndarray
-    micro_command_n: np.ndarray | None
+    macro_motor_n: np.ndarray  # what a drive makes of its commands, with what is known of its command path
+    micro_motor_n: np.ndarray | None
     penetration_m: np.ndarray | None
     penetration_velocity_m_per_s: np.ndarray | None
     side: np.ndarray | None
@@ -104,25 +106,21 @@ def put_together(
     edges_out_m: EdgesOut = (0.0, 0.0),
 ) -> Recording:
     """Put together what is known along a motion; without one of the end, its own is made of the positions alone."""
-    h = log.period_s
-    macro_n, macro_at_n = driven(log.macro_command_n, believed.macro.latch_s, believed.macro.current_loop_s, h)
-    at_samples_n = {"macro": macro_at_n}
-    micro_n = None
+    made_n = {"macro": _driven(log, (), "macro", acting_on("macro", believed, at_size), believed.macro)}
     if log.end_position_m is not None and log.micro_command_n is not None and believed.micro is not None:
-        end = end or motion_of(log.end_position_m, h, believed.micro.noise_m)
-        micro_n, at_samples_n["end"] = driven(
-            log.micro_command_n, believed.micro.latch_s, believed.micro.current_loop_s, h
-        )
+        end = end or motion_of(log.end_position_m, log.period_s, believed.micro.noise_m)
+        made_n["end"] = _driven(log, (), "end", acting_on("end", believed, at_size), believed.micro)
     else:
         end = None
+    micro_n = made_n["end"][0] if end is not None else None
     recording = Recording(
-        log, believed, macro, end, macro_n, micro_n, None, None, None, {}, {}, {}, {}, {}, {}, at_size, late,
+        log, believed, macro, end, made_n["macro"][0], micro_n, None, None, None, {}, {}, {}, {}, {}, {}, at_size, late,
         edges_out_m,
     )  # fmt: skip
     _read(recording)
     for axis, reported_a in (("macro", log.macro_current_a), ("end", log.micro_current_a)):
         if axis in recording.axes and reported_a is not None and recording.belief(axis).current_noise_a is not None:
-            believed_a = at_samples_n[axis] / recording.belief(axis).force_constant_n_per_a
+            believed_a = made_n[axis][1] / recording.belief(axis).force_constant_n_per_a
             recording.reported_a[axis] = reported_a - believed_a
     return recording
 
@@ -138,10 +136,11 @@ def _read(recording: Recording) -> None:
     """Write down what follows from how late readings are: motors as each body feels them, motion now, contact."""
     log, believed, late = recording.log, recording.believed, recording.late
     for axis in recording.axes:
-        command_n, motor_n = log.macro_command_n, recording.macro_command_n
-        if axis == "end" and log.micro_command_n is not None and recording.micro_command_n is not None:
-            command_n, motor_n = log.micro_command_n, recording.micro_command_n
-        recording.felt_n[axis] = _felt_n(late, axis, log, command_n, recording.belief(axis), motor_n)
+        felt_n = recording.macro_motor_n if axis == "macro" else recording.micro_motor_n
+        if felt_n is None or _is_late(late, axis):
+            acting = acting_on(axis, believed, recording.at_size)
+            felt_n, _ = driven_by(recording, axis, acting, recording.belief(axis))
+        recording.felt_n[axis] = felt_n
         recording.now[axis] = late_readings.motion_now(late, axis, log, recording.motion(axis))
     if recording.end is not None:
         macro, end = recording.now["macro"], recording.now["end"]
@@ -173,13 +172,39 @@ def contact_push_n(recording: Recording, damping_n_s_per_m: float) -> np.ndarray
     return recording.pushed_n[damping_n_s_per_m]
 
 
-def _felt_n(
-    late: tuple[Row, ...], axis: str, log: Log, command_n: np.ndarray, belief: BelievedAxis, motor_n: np.ndarray
-) -> np.ndarray:
-    """Return a motor's force on the clock of its body's readings."""
-    if not any(row["acts_on"] == f"{axis}_sensor" for row in late):
-        return motor_n
-    return late_readings.motor_n(late, axis, log, command_n, belief.latch_s, belief.current_loop_s)
+def acting_on(axis: str, believed: Believed, at_size: Sequence[Row]) -> list[Acting]:
+    """Return the effects of the command path of a body's drive that are believed or found."""
+    place = "macro_command" if axis == "macro" else "micro_command"
+    rows = [row for row in (*believed.effects, *at_size) if row["acts_on"] == place]
+    effects = [(CATALOGUE[row["name"]], row) for row in rows]
+    return [(effect, [row[name] for name in effect.parameters]) for effect, row in effects]
+
+
+def driven_by(
+    recording: Recording, axis: str, acting: Sequence[Acting], drive: BelievedAxis
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a drive with such effects of its command path makes of the commands, N.
+
+    Means over parts of intervals on the clock of its body's readings (n, parts), values at samples (n,).
+    """
+    return _driven(recording.log, recording.late, axis, acting, drive)
+
+
+def _driven(
+    log: Log, late: tuple[Row, ...], axis: str, acting: Sequence[Acting], drive: BelievedAxis
+) -> tuple[np.ndarray, np.ndarray]:
+    command_n = log.macro_command_n if axis == "macro" else log.micro_command_n
+    if command_n is None:
+        raise KeyError(axis)
+    constant = drive.force_constant_n_per_a
+    means_n, at_samples_n = made_by(acting, command_n, constant, drive.latch_s, drive.current_loop_s, log.period_s)
+    if _is_late(late, axis):
+        means_n = late_readings.motor_n(late, axis, log, acting, command_n, drive)
+    return means_n, at_samples_n
+
+
+def _is_late(late: tuple[Row, ...], axis: str) -> bool:
+    return any(row["acts_on"] == f"{axis}_sensor" for row in late)
 
 
 def relative_motion(recording: Recording) -> tuple[np.ndarray, np.ndarray]:

@@ -45,7 +45,7 @@ def in_step_with_motor(recordings: Sequence[Recording], axis: str, signals: list
     """
     found = []
     for recording, signal in zip(recordings, signals, strict=True):
-        motor_n = recording.macro_command_n if axis == "macro" else recording.micro_command_n
+        motor_n = recording.macro_motor_n if axis == "macro" else recording.micro_motor_n
         found.append(np.zeros_like(signal) if motor_n is None else signal * motor_n.mean(axis=1))
     return found
 
