@@ -99,6 +99,9 @@ def looked_closely(
                 break
             look = known = plain = anew
             moved = ()
+        elif any(is_taken_at_size(search, group) for group in chosen):
+            look = known = _told_anew(look, unsettled, crew)
+            moved = moved_now(search, known.chosen)
         else:
             break
     belief = belief_under(first, look.search, crew)

@@ -18,6 +18,7 @@ from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.forces import squares_of
 from stagectl.gap.grids import free_shapes, near_travel_m
 from stagectl.gap.hypotheses import Term
+from stagectl.gap.late_readings import makes_late
 from stagectl.gap.normal_equations import Group, Placed, active_slots, covers, normal_of
 from stagectl.gap.reading_errors import moved_m
 from stagectl.gap.recording import Recording
@@ -37,6 +38,7 @@ LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)
 _LEAST_ASKED = 0.02
 _MOVED_M = (0.3e-6, 1e-6, 3e-6, 10e-6, 30e-6, 100e-6, 500e-6)
+_MISREAD_M = (0.3e-6, 1e-6, 3e-6, 10e-6, *np.geomspace(30e-6, 500e-6, 12))
 _EDGE_MOVED_M = (0.3e-6, 1e-6, 3e-6, *np.arange(5e-6, 60e-6, 5e-6), *np.geomspace(60e-6, 500e-6, 22))
 """How far an edge may lie elsewhere. Its gain stands out no wider than contacts are deep, however far it has moved:
 10 um under 100 N. An edge 23 um out gained nothing at 10 and at 30 um, where half of all contact is another one."""
@@ -172,7 +174,7 @@ class Refiner:
             moves_m = max(
                 moved_m(r, effect, term.acts_on, shape | {amplitude: unit}) for r in self._evidence.recordings
             )
-            tried_m = _EDGE_MOVED_M if term.acts_on == "contact_edge" else _MOVED_M
+            tried_m = _EDGE_MOVED_M if term.acts_on == "contact_edge" else _MOVED_M if makes_late(effect) else _MISREAD_M
             sizes = [sign * size_m * unit / max(moves_m, 1e-300) for size_m in tried_m for sign in (1.0, -1.0)]
         else:
             asked = float(self._amplitudes(self._evidence.columns_of(term), term)[0])

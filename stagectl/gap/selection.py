@@ -266,7 +266,9 @@ class Judge:
                 if self._worth([*rest, one]) > least and self._allowed([*rest, one])
             ]
             if whole:
-                found = [*rest, max(whole, key=lambda one: self._worth([*rest, one]))]
+                at = found.index(two[0])
+                rest.insert(at, max(whole, key=lambda one: self._worth([*rest, one])))
+                found = rest
         return found
 
     def _like_both(self, rest: Sequence[Group], two: tuple[Group, Group]) -> list[Group]:
@@ -332,7 +334,8 @@ class Judge:
             parts = self._two_like(rest, group)
             as_good = self._worth([*rest, *parts]) > self._worth(found) - self._excused_of_parts(found, group)
             if parts and as_good and self._allowed([*rest, *parts]):
-                found = [*rest, *parts]
+                at = found.index(group)
+                found = [*found[:at], *parts, *found[at + 1 :]]  # in its place: a closer look goes by who was there
         return found
 
     def _two_like(self, rest: Sequence[Group], group: Group) -> list[Group]:
