@@ -4,7 +4,7 @@ An effect is known along a motion that knows of the effect, and an edge where th
 each closer look; one more is taken where a name has moved the joint again. Pure.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -74,8 +74,10 @@ def looked_closely(
         solution = solve([*search.judge.base, *chosen], search.evidence.sums)
         at_size = remeasured(search, solution, known.named, search.moved) if search.moved else ()
         look = Look(search, chosen, at_size + all_named(search, chosen))
-        if search.judge.lacks_a_name(chosen) and unknown_rest(
-            search, chosen, excess(belief_under(first, search, crew), [])
+        if (
+            search.judge.lacks_a_name(chosen)
+            and not any(moves_joint(search, group) for group in chosen)
+            and unknown_rest(search, chosen, excess(belief_under(first, search, crew), []))
         ):
             break  # no further look gives it one
         gone = {(one.name, one.acts_on) for one in at_size if not stands(one, search.evidence.recordings[0])}
@@ -94,11 +96,14 @@ def looked_closely(
             known, moved = look, moved_now(search, look.chosen)
         elif _keys(look) > compared and (anew := _again_in(first, plain, look, unsettled, crew)) is not None:
             compared = _keys(look)
-            if _keys(anew) == compared:
-                look = _with_forms_of(look, anew)
+            if _keys(anew) != compared:
+                look = known = plain = anew
+                moved = ()
+                continue
+            look = _with_forms_of(look, anew)
+            if not any(is_taken_at_size(search, group) for group in chosen):
                 break
-            look = known = plain = anew
-            moved = ()
+            known, moved = look, moved_now(search, chosen)
         elif any(is_taken_at_size(search, group) for group in chosen):
             look = known = _told_anew(look, unsettled, crew)
             moved = moved_now(search, known.chosen)
@@ -144,8 +149,12 @@ def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Loo
             continue
         rest = [*chosen[:k], *chosen[k + 1 :]]
         least = search.judge.gain(chosen) - ALIAS_GAIN
-        others = [other for other in search.judge.rivals(rest) if _is_other_form(search, group, other)]
-        forms = [group, *(other for other in others if search.judge.gain([*rest, other]) > least)]
+        stated = {alias[:2] for one in named if (one.name, one.acts_on) == group.key for alias in one.aliases}
+        others = [other for other in search.judge.rivals(rest) if _is_other_form(search, group, other, stated)]
+        forms = [
+            group,
+            *(other for other in others if other.key in stated or search.judge.gain([*rest, other]) > least),
+        ]
         left = _left_under(search, [[*rest, form] for form in forms], unsettled, crew) if len(forms) > 1 else []
         best = _least(left)
         gone = {
@@ -158,9 +167,14 @@ def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Loo
     return Look(search, chosen, named)
 
 
-def _is_other_form(search: Competition, group: Group, other: Group) -> bool:
-    """Tell whether two names move readings at the same place."""
-    return moves_readings(search, other) and other.key[1] == group.key[1] and other.key[0] != group.key[0]
+def _is_other_form(search: Competition, group: Group, other: Group, stated: Collection[tuple[str, str]] = ()) -> bool:
+    """Tell whether two names move readings, at the same place or where one is `stated` as an alias of the other.
+
+    A scale error of 263 ppm that was looked for without the joint at its place gained 54 squares of 36 700 more than
+    one of the other sensor: as much as laws may be inexact by. Each at its size, they are no less exact than others.
+    """
+    near = other.key[1] == group.key[1] or other.key in stated
+    return moves_readings(search, other) and near and other.key != group.key
 
 
 def _told_at_size(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Look:

@@ -174,7 +174,9 @@ class Refiner:
             moves_m = max(
                 moved_m(r, effect, term.acts_on, shape | {amplitude: unit}) for r in self._evidence.recordings
             )
-            tried_m = _EDGE_MOVED_M if term.acts_on == "contact_edge" else _MOVED_M if makes_late(effect) else _MISREAD_M
+            tried_m = (
+                _EDGE_MOVED_M if term.acts_on == "contact_edge" else _MOVED_M if makes_late(effect) else _MISREAD_M
+            )
             sizes = [sign * size_m * unit / max(moves_m, 1e-300) for size_m in tried_m for sign in (1.0, -1.0)]
         else:
             asked = float(self._amplitudes(self._evidence.columns_of(term), term)[0])
