@@ -144,7 +144,13 @@ def _means_between(edges: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     for k in range(n + 1):
         inside = min(max(edges[k], 0.0), float(n))
         low = min(int(inside), n - 1)
-        moved = impulse[low] + (impulse[low + 1] - impulse[low]) * (inside - low)
+        f = inside - low
+        moved = impulse[low] + (impulse[low + 1] - impulse[low]) * f
+        if 0 < low < n - 1:  # on a cubic through four edges (Lagrange): what a line leaves of it
+            before_it, after_it = impulse[low + 1] - impulse[low - 1], impulse[low + 2] - impulse[low]
+            here = impulse[low + 1] - impulse[low]
+            first, second = 2.0 * here - before_it, after_it - 2.0 * here
+            moved += f * (f - 1.0) * (first + (second - first) * (f + 1.0) / 3.0) / 2.0
         moved += (edges[k] - inside) * (force_n[0] if edges[k] < inside else force_n[n - 1])
         if k > 0:
             means[k - 1] = (moved - before) * (edges[k] - edges[k - 1])
