@@ -306,4 +306,6 @@ def _under(
         crew=crew,
     )
     search.judge.threshold, search.judge.trace = first.judge.threshold, first.judge.trace
+    at_size = {(effect.name, place) for effect, place, _ in motion.moved}
+    search.judge.at_size = sum(one.gain for one in known.named if (one.name, one.acts_on) in at_size)
     return search
