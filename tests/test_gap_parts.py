@@ -118,6 +118,14 @@ def test_the_planted_term_is_found_and_its_twin_is_an_alias():
     assert solve([*judge.base, chosen[0]], judge.training).of(chosen[0])[0][0] == pytest.approx(0.3, abs=0.03)
 
 
+@pytest.mark.parametrize(("at_size", "names_count"), [(1e8, 1), (2e9, 0)])
+def test_beside_what_is_taken_at_its_size_a_name_gains_more_than_that_is_inexact_by(at_size, names_count):
+    """The planted term gains 1100 squares; a clock of the other sensor that was none gained 67 beside 367 million."""
+    judge = _judge(0.3)
+    judge.at_size = at_size
+    assert len(judge.select()) == names_count
+
+
 @pytest.mark.parametrize(("wider", "is_alias"), [("cable_spring", True), ("stribeck_friction", False)])
 def test_a_law_about_a_place_is_no_wider_than_one_about_zero(wider, is_alias):
     """A cable's anchor may be anywhere; a Stribeck friction has a number more than what it is a case of."""
@@ -318,6 +326,22 @@ def test_bristles_that_slip_by_nothing_are_a_level_and_a_rise(slip, names):
     level, rise = Group(("coulomb_friction", place), (1,)), Group(("stribeck_friction", place), (2,), searched=1)
     judge = _table_judge(draw, [level, rise, Group(("lugre_friction", place), (3,), searched=3)])
     assert {group.key[0] for group in judge.select()} == names
+
+
+def test_parts_of_bristles_stand_where_the_bristles_stood():
+    """A closer look asks what would have done as well beside the names before: behind all, parts were none of them."""
+
+    def draw(run, random):
+        level, rise, later = (random.standard_normal(4000) for _ in range(3))
+        bristles = 5.0 * level + 3.0 * rise
+        return [random.standard_normal(4000) + bristles + later, level, rise, bristles, later]
+
+    place = "macro_force"
+    level, rise = Group(("coulomb_friction", place), (1,)), Group(("stribeck_friction", place), (2,), searched=1)
+    bristles, later = Group(("lugre_friction", place), (3,), searched=3), Group(("offset", "micro_force"), (4,))
+    chosen = _table_judge(draw, [level, rise, bristles, later]).select()
+    assert len(chosen) == 3
+    assert chosen[-1] is later
 
 
 def test_a_law_that_loses_by_more_than_is_left_is_none_that_inexact_laws_excuse():
