@@ -278,6 +278,6 @@ def test_figures_are_png_too():
 def test_known_forces_are_left_as_they_were():
     """Modelled forces are sums of their own: what balance keeps for later must not change."""
     recording = balance.recording_of(_pushed(_sine(3000, 1.0, 9.0), np.zeros(3000)), _believed())
-    before = recording.macro_command_n.copy()
+    before = recording.macro_motor_n.copy()
     residual.modelled_forces(recording, _findings(refitted={"macro_mass_kg": 0.1, "macro_force_constant": -0.2}))
-    assert np.array_equal(recording.macro_command_n, before)
+    assert np.array_equal(recording.macro_motor_n, before)
