@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from stagectl.effects import CATALOGUE, Trait
+from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import hypotheses
 from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.forces import squares_of
@@ -37,8 +37,12 @@ _NEAR_ZERO = 0.05
 LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)
 _LEAST_ASKED = 0.02
-_MOVED_M = (0.3e-6, 1e-6, 3e-6, 10e-6, 30e-6, 100e-6, 500e-6)
+_LATE_M = (0.3e-6, 1e-6, 3e-6, 10e-6, 30e-6, 100e-6, 500e-6)
+"""How far late readings may be from where a body is; a body that rests is read where it is."""
+
 _MISREAD_M = (0.3e-6, 1e-6, 3e-6, 10e-6, *np.geomspace(30e-6, 500e-6, 12))
+"""The same of other errors of a sensor: one of 140 um gained nothing at 30 and at 500 um, and little at 100."""
+
 _EDGE_MOVED_M = (0.3e-6, 1e-6, 3e-6, *np.arange(5e-6, 60e-6, 5e-6), *np.geomspace(60e-6, 500e-6, 22))
 """How far an edge may lie elsewhere. Its gain stands out no wider than contacts are deep, however far it has moved:
 10 um under 100 N. An edge 23 um out gained nothing at 10 and at 30 um, where half of all contact is another one."""
@@ -174,9 +178,7 @@ class Refiner:
             moves_m = max(
                 moved_m(r, effect, term.acts_on, shape | {amplitude: unit}) for r in self._evidence.recordings
             )
-            tried_m = (
-                _EDGE_MOVED_M if term.acts_on == "contact_edge" else _MOVED_M if makes_late(effect) else _MISREAD_M
-            )
+            tried_m = _tried_m(effect, term.acts_on)
             sizes = [sign * size_m * unit / max(moves_m, 1e-300) for size_m in tried_m for sign in (1.0, -1.0)]
         else:
             asked = float(self._amplitudes(self._evidence.columns_of(term), term)[0])
@@ -351,6 +353,13 @@ def _side_by_side(columns: Sequence[Columns]) -> Columns:
         return np.concatenate([np.zeros_like(there) if part is None else part for part in parts])
 
     return [[of(parts) for parts in zip(*channels, strict=True)] for channels in zip(*columns, strict=True)]
+
+
+def _tried_m(effect: Effect, place: str) -> tuple[float, ...]:
+    """Return by how much an effect that moves edges or readings is tried to move them."""
+    if place == "contact_edge":
+        return _EDGE_MOVED_M
+    return _LATE_M if makes_late(effect) else _MISREAD_M
 
 
 def gain_at_size(evidence: Evidence, refiner: Refiner, term: Term) -> float:
