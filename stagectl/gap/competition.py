@@ -135,6 +135,13 @@ class Competition:
         found = dict(zip(terms, gains, strict=True))
         return [found[asked[group.columns]] if group.columns in asked else 0.0 for group in groups]
 
+    def fine_curves(self) -> list[Group]:
+        """Return tables over position with finer steps than those that compete."""
+        terms = list(hypotheses.fine_curve_terms(self.evidence.recordings))
+        columns = self._crew.here(self.evidence.columns_of, terms)
+        added = [Added(term, one, widest_amplitudes(term), 0) for term, one in zip(terms, columns, strict=True)]
+        return self.evidence.append_all(added)
+
     def _brought_near(self, group: Group) -> Group:
         """Return a law that acts about a place no farther from the travel than the grid has it beside it."""
         term = self.term(group)

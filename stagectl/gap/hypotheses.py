@@ -386,6 +386,7 @@ def phase_of(effect: Effect, amplitude: str) -> str | None:
 
 
 _KNOTS_COUNT = 12
+_FINE_KNOTS_COUNT = 48
 _LEAST_CURVE_N = 1.0  # as large as what drives, or so much: free, curves and known parameters cancel out at kilonewtons
 _CURVES = ("position_m", "velocity_m_per_s", "t_s")  # not acceleration: its line is a mass, and shrinks any rest
 
@@ -394,19 +395,30 @@ def curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
     """Yield tables over one quantity of each body: what stands for an effect that no library has."""
     axes = recordings[0].axes
     for axis in axes:
-        for quantity in (*_CURVES, *(("relative_position_m",) if len(axes) > 1 else ())):
-            spans = [quantities(r, axis, "macro_force")[quantity] for r in recordings]
-            low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
-            if not high > low:
-                continue
-            knots = np.linspace(low, high, _KNOTS_COUNT)
+        relative = ("relative_position_m",) if len(axes) > 1 else ()
+        yield from _tables(recordings, axis, (*_CURVES, *relative), _KNOTS_COUNT)
 
-            forces = partial(_hats, axis, quantity, knots)
-            place = "macro_force" if axis == "macro" else "micro_force"
-            names = tuple(f"{knot:.6g}" for knot in knots)
-            commands = [r.log.macro_command_n if axis == "macro" else r.log.micro_command_n for r in recordings]
-            most_n = max(_LEAST_CURVE_N, *(float(np.std(c)) for c in commands if c is not None))
-            yield Term(f"curve over {quantity}", place, {}, names, forces, bounds=((-most_n, most_n),) * _KNOTS_COUNT)
+
+def fine_curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
+    """Yield tables over the position of each body whose steps are a quarter of those of other curves."""
+    for axis in recordings[0].axes:
+        yield from _tables(recordings, axis, ("position_m",), _FINE_KNOTS_COUNT)
+
+
+def _tables(recordings: Sequence[Recording], axis: str, over: Sequence[str], knots_count: int) -> Iterator[Term]:
+    for quantity in over:
+        spans = [quantities(r, axis, "macro_force")[quantity] for r in recordings]
+        low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
+        if not high > low:
+            continue
+        knots = np.linspace(low, high, knots_count)
+
+        forces = partial(_hats, axis, quantity, knots)
+        place = "macro_force" if axis == "macro" else "micro_force"
+        names = tuple(f"{knot:.6g}" for knot in knots)
+        commands = [r.log.macro_command_n if axis == "macro" else r.log.micro_command_n for r in recordings]
+        most_n = max(_LEAST_CURVE_N, *(float(np.std(c)) for c in commands if c is not None))
+        yield Term(f"curve over {quantity}", place, {}, names, forces, bounds=((-most_n, most_n),) * knots_count)
 
 
 def _hats(axis: str, quantity: str, knots: np.ndarray, r: Recording) -> list[Forces]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from stagectl.gap.competition import Competition
 from stagectl.gap.normal_equations import Group, solve
-from stagectl.gap.selection import ALIAS_GAIN, CURVE_GAIN, MATERIAL_RATIO, Judge
+from stagectl.gap.selection import ALIAS_GAIN, CURVE_GAIN, MATERIAL_RATIO, SEARCH_PRICE, Judge
 
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
@@ -48,10 +48,25 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
             best, gained = curve, gain
     judge.trace.append(f"left over {left:.0f} of {first:.0f}, noise {noise:.0f}, best curve {gained:.0f}")
     floor = _LEFT_SDS * noise + _LEFT_SHARE * max(first, 0.0)
-    material = best is not None and gained > max(CURVE_GAIN * judge.threshold, _CURVE_SHARE * max(first, 0.0))
-    if not left > floor and not material:
+    least = max(CURVE_GAIN * judge.threshold, _CURVE_SHARE * max(first, 0.0))
+    if not left > floor and not gained > least and not (left > least and _is_kinked(search, chosen, least)):
         return None
     return _curve_found(search, chosen, best, left, first, gained)
+
+
+def _is_kinked(search: Competition, chosen: list[Group], least: float) -> bool:
+    """Tell whether a finer curve over position finds what laws leave, beyond what it gains on noise.
+
+    A spring with a dead zone is a cable and two ripples as long as the travel, but for its two kinks: 5800 squares of
+    388 000 were left, of which twelve knots found 350 and forty-eight 5000.
+    """
+    now = search.judge.gain(chosen)
+    for curve in search.fine_curves():
+        gained = search.judge.gain([*chosen, curve]) - now
+        search.judge.trace.append(f"a finer curve on {curve.key[1]} finds {gained:.0f}")
+        if gained > least + SEARCH_PRICE * len(curve.columns):
+            return True
+    return False
 
 
 def one_curve_for_many(judge: Judge, chosen: list[Group]) -> tuple[list[Group], Group | None]:

@@ -199,7 +199,7 @@ def _told_at_size(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Loo
         best = _least(left)
         if best and left[0].squares - left[best].squares > ALIAS_GAIN:
             chosen = [*before, forms[best]]
-            return Look(search, chosen, all_named(search, chosen))
+            return Look(search, chosen, _at_size(look) + all_named(search, chosen))
     return look
 
 
@@ -278,10 +278,15 @@ def _measured(look: Look) -> Look:
     search = look.search
     chosen, solution = at_best_shapes(search, look.chosen)
     named = measured(search, chosen, solution, look.named)
-    moved = {(effect.name, place) for effect, place, _ in search.moved}
-    at_size = tuple(one for one in named if (one.name, one.acts_on) in moved)
-    others = tuple(one for one in named if (one.name, one.acts_on) not in moved)
+    at_size = _at_size(look._replace(named=named))
+    others = tuple(one for one in named if one not in at_size)
     return Look(search, chosen, remeasured(search, solution, at_size, search.moved) + others, solution)
+
+
+def _at_size(look: Look) -> tuple[Named, ...]:
+    """Return the names of a look that are part of its operating point."""
+    moved = {(effect.name, place) for effect, place, _ in look.search.moved}
+    return tuple(one for one in look.named if (one.name, one.acts_on) in moved)
 
 
 def _under(
