@@ -18,7 +18,7 @@ from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.forces import Forces
 from stagectl.gap.hypotheses import widest_amplitudes
 from stagectl.gap.innovations import moments
-from stagectl.gap.left_over import one_curve_for_many
+from stagectl.gap.left_over import is_kinked, one_curve_for_many
 from stagectl.gap.log import Log, log_of_rows
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
@@ -426,8 +426,11 @@ def test_one_elimination_gives_what_solving_anew_gives():
 
 
 @functools.cache
-def _axis_log(name: str, friction_n: float, seed: int, n: int = 8000) -> Log:
-    """An axis under a spring-like controller of its own, with dry friction that nobody is told of."""
+def _axis_log(name: str, friction_n: float, seed: int, n: int = 8000, ripple_n: float = 0.0) -> Log:
+    """An axis under a spring-like controller of its own, with forces that nobody is told of.
+
+    friction_n: dry; ripple_n: over 4.36 mm, an eleventh of the way.
+    """
     random = np.random.default_rng(seed)
     parts = 20
     t = np.arange(n) * H
@@ -440,7 +443,8 @@ def _axis_log(name: str, friction_n: float, seed: int, n: int = 8000) -> Log:
         command[k] = 4.0e4 * (reference[k] - seen[k]) + 2.5e3 * (speed[k] - v)
         for _ in range(parts):
             x += 0.5 * v * H / parts
-            v += (command[k] - friction_n * math.tanh(v / 1e-4) - 30.0 * v + slow[k]) / MASS * H / parts
+            hidden = friction_n * math.tanh(v / 1e-4) + ripple_n * math.sin(1441.0 * x)
+            v += (command[k] - hidden - 30.0 * v + slow[k]) / MASS * H / parts
             x += 0.5 * v * H / parts
     return Log(name, H, seen, command, np.ones(n, bool), "1", reference_m=reference)
 
@@ -467,6 +471,23 @@ def test_hidden_dry_friction_is_named_and_nothing_where_nothing_is_missing(frict
     sd = findings.refitted_sds["macro_mass_kg"]
     assert 0.0 < sd < 0.01
     assert findings.refitted["macro_mass_kg"] == pytest.approx(-0.005, abs=3.0 * sd)
+
+
+LEAST_SQUARES = 500.0
+
+
+@pytest.mark.parametrize(("ripple_n", "is_found"), [(0.5, True), (0.0, False)])
+def test_what_twelve_knots_over_position_do_not_find_forty_eight_do(ripple_n, is_found):
+    log = _axis_log("run 1", 1.0, 1, ripple_n=ripple_n)
+    recordings = [balance.recording_of(log, _believed())]
+    search = Competition(recordings, 1, noise=noise_of(recordings))
+    friction = max(
+        (group for group in search.judge.library if group.key == ("coulomb_friction", "macro_force")),
+        key=lambda group: search.judge.gain([group]),
+    )
+    gained = (search.judge.gain([friction, curve]) - search.judge.gain([friction]) for curve in search.curves)
+    assert max(gained) < LEAST_SQUARES
+    assert is_kinked(search, [friction], LEAST_SQUARES) == is_found
 
 
 @functools.cache

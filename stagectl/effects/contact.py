@@ -112,7 +112,7 @@ def backlash_centre_shift(contact_side_ratio, shift_m):
 
 @effect(
     places=("contact_edge",),
-    rate_m_per_s=(-1e-4, 1e-4),
+    rate_m_per_s=(0.0, 1e-4),
     linear=("rate_m_per_s",),
     shown_by="contact",
     symptom="contact sets in later and later in the course of a run",

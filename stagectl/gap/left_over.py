@@ -49,12 +49,12 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
     judge.trace.append(f"left over {left:.0f} of {first:.0f}, noise {noise:.0f}, best curve {gained:.0f}")
     floor = _LEFT_SDS * noise + _LEFT_SHARE * max(first, 0.0)
     least = max(CURVE_GAIN * judge.threshold, _CURVE_SHARE * max(first, 0.0))
-    if not left > floor and not gained > least and not (left > least and _is_kinked(search, chosen, least)):
+    if not left > floor and not gained > least and not (left > least and is_kinked(search, chosen, least)):
         return None
     return _curve_found(search, chosen, best, left, first, gained)
 
 
-def _is_kinked(search: Competition, chosen: list[Group], least: float) -> bool:
+def is_kinked(search: Competition, chosen: list[Group], least: float) -> bool:
     """Tell whether a finer curve over position finds what laws leave, beyond what it gains on noise.
 
     A spring with a dead zone is a cable and two ripples as long as the travel, but for its two kinks: 5800 squares of
