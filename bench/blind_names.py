@@ -197,7 +197,6 @@ TRANSLATIONS: tuple[Translation, ...] = (
         (("contact", "joint"),),
         {"force_at_reference_n": _same("stiffness_n_per_m3", _REFERENCE_DEPTH_M**3)},
     ),
-    # As with Stribeck friction: ours is the slope beside a Coulomb friction.
     Translation(
         "position_dependent_friction",
         "position_dependent_friction",
@@ -206,7 +205,6 @@ TRANSLATIONS: tuple[Translation, ...] = (
             "level_n": _same("level_n"),
             "slope_per_100_mm": _ratio("slope_n_per_m", "level_n", scale=_REFERENCE_M),
         },
-        beside="coulomb_friction",
     ),
     # The truth's right edge is where the end is ahead, ours where the macro is.
     Translation("backlash_centre", "backlash_centre_shift", _EDGE, {"shift_m": _same("shift_m", -1.0)}),

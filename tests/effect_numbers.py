@@ -73,7 +73,12 @@ WORKED: dict[str, list[Case]] = {
     ],
     "linear_stiffness": [Case((2e-3, 500.0), -1.0), Case((-1e-3, -500.0), -0.5)],
     "cubic_stiffness": [Case((1e-3, 1e9), -1.0), Case((-2e-3, 1e9), 8.0)],
-    "position_dependent_friction": [Case((0.3, 0.1, 2.0, 1e-3), -0.6), Case((0.3, -0.1, 2.0, 1e-3), 0.6)],
+    "position_dependent_friction": [
+        Case((0.3, 0.1, 1.0, 2.0, 1.0, 1e-3), -1.6),
+        Case((0.3, -0.1, 1.0, 2.0, 1.0, 1e-3), 1.6),
+        Case((-0.3, 0.1, 0.4, 2.0, -0.2, 1e-3), 0.0),  # it has ended at -200 mm
+        Case((0.3, 0.1, 0.4, 2.0, -0.2, 1e-3), -1.0),
+    ],
     # ---- periodic: a quarter of the pitch from phase 0 is the crest; phase pi/6 at 0 is half of it ----
     "cogging": [Case((0.006, 3.0, 0.024, 0.0), 3.0), Case((0.0, 3.0, 0.024, math.pi / 6.0), 1.5)],
     # 3 sin(pi/2) + 2 sin(pi + pi/6)
@@ -192,7 +197,7 @@ PARAMETERS: dict[str, tuple[float, ...]] = {  # some plausible values, in the or
     "cable_hysteresis": (3.0, 4e-3, 0.0),
     "linear_stiffness": (40.0,),
     "cubic_stiffness": (1e9,),
-    "position_dependent_friction": (5.0, 1e-3),
+    "position_dependent_friction": (1.0, 5.0, 0.1, 1e-3),
     "cogging": (3.0, 0.024, 0.4),
     "harmonic_cogging": (3.0, 1.0, 0.024, 0.4, -1.0),
     "current_ripple": (0.01, 0.024, 0.4),

@@ -71,7 +71,8 @@ CASES = [  # truth, place, our parameters, of the effect beside it
     ("tilt", "macro_force", {"grade_ratio": 0.8e-3}, {}),
     ("linear_stiffness", "macro_force", {"stiffness_n_per_m": 20.0}, {}),
     ("cubic_stiffness", "macro_force", {"stiffness_n_per_m3": 900.0}, {}),
-    ("position_dependent_friction", "macro_force", {"slope_n_per_m": -9.0}, {"level_n": 2.0}),
+    ("position_dependent_friction", "macro_force", {"level_n": 2.0, "slope_n_per_m": -9.0, "ends_m": 10.0}, {}),
+    ("position_dependent_friction", "macro_force", {"level_n": 2.0, "slope_n_per_m": -40.0, "ends_m": 0.05}, {}),
     ("micro_reaction", "macro_force", {"fraction_ratio": 0.6}, {}),
     ("dahl_friction", "macro_force", {"level_n": 2.0, "slip_m": 2e-5}, {}),
     ("lugre_friction", "macro_force",
@@ -122,7 +123,9 @@ def translated(*effects):
     return in_words_of_the_truth(findings(*effects))["effects"]
 
 
-@pytest.mark.parametrize(("truth", "acts_on", "ours", "beside"), CASES, ids=[case[0] for case in CASES])
+@pytest.mark.parametrize(
+    ("truth", "acts_on", "ours", "beside"), CASES, ids=[f"{case[0]} {k}" for k, case in enumerate(CASES)]
+)
 def test_translated_parameters_make_the_same_force(truth, acts_on, ours, beside):
     table = next(one for one in TRANSLATIONS if one.truth == truth)
     said = [named(table.ours, acts_on, ours)]

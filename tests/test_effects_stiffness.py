@@ -47,8 +47,8 @@ def test_harmonics_of_cogging_are_cogging_of_half_the_pitch():
 
 def test_friction_that_changes_along_the_way_adds_to_a_coulomb_friction():
     position, velocity = np.array([0.3, 0.3, -0.3, -0.3]), np.array([0.1, -0.1, 0.1, -0.1])
-    whole = CATALOGUE["position_dependent_friction"].law(position, velocity, 2.0, 1e-3)
-    whole = whole + CATALOGUE["coulomb_friction"].law(velocity, 4.0, 1e-3)
+    whole = CATALOGUE["position_dependent_friction"].law(position, velocity, 1.0, 2.0, 10.0, 1e-3)
+    whole = whole + CATALOGUE["coulomb_friction"].law(velocity, 3.0, 1e-3)
     np.testing.assert_allclose(whole, [-4.6, 4.6, -3.4, 3.4], rtol=1e-12)
 
 

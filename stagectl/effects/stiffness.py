@@ -105,13 +105,21 @@ def cubic_stiffness(position_m, stiffness_n_per_m3):
 
 @effect(
     places=_AXES,
+    level_n=(0.0, 1e3),
     slope_n_per_m=(-1e4, 1e4),
+    ends_m=(-10.0, 10.0),
     smoothing_m_per_s=(1e-7, 1e-1),
-    linear=("slope_n_per_m",),
+    linear=("level_n", "slope_n_per_m"),
+    searched=("ends_m",),
     shown_by="strokes",
     symptom="a step at each reversal that grows along the way",
     reference="Armstrong-Helouvry, Control of Machines with Friction, 1991, chapter 4: friction along the way",
 )
-def position_dependent_friction(position_m, velocity_m_per_s, slope_n_per_m, smoothing_m_per_s):
-    """Dry friction that changes along the way: F = -k x tanh(v / v_s), beside a Coulomb friction that it adds to."""
-    return -slope_n_per_m * position_m * np.tanh(velocity_m_per_s / smoothing_m_per_s)
+def position_dependent_friction(position_m, velocity_m_per_s, level_n, slope_n_per_m, ends_m, smoothing_m_per_s):
+    """Dry friction that changes along the way: F = -(F_c + k x) tanh(v / v_s).
+
+    Farther from zero than `ends_m`, on its side, it stays as it is there: dry friction that has ended never drives.
+    """
+    side = np.copysign(1.0, ends_m)
+    along_m = side * np.minimum(side * position_m, side * ends_m)
+    return -(level_n + slope_n_per_m * along_m) * np.tanh(velocity_m_per_s / smoothing_m_per_s)

@@ -27,6 +27,11 @@ squares of 115 000, and the offset that it mostly is 105 000."""
 
 _BESIDE = 1.5  # of half the travel from its middle: as far as what acts about a place is still said to do so
 
+NOWHERE_M = 10.0
+"""Farther than any travel: where dry friction ends that does not end."""
+
+_ENDS = (0.3, -0.3, 0.7, -0.7)  # of half the travel from its middle
+
 _LASER_M = 632.8e-9
 
 _SLOPE_S = 1e-8
@@ -67,7 +72,11 @@ def grids_for(recordings: Sequence[Recording]) -> Grid:
         ],
         "sublinear_viscous_friction": [{"exponent_ratio": p} for p in (0.3, 0.45, 0.6, 0.75)],
         "load_dependent_friction": smooth[::2],
-        "position_dependent_friction": smooth[::2],
+        "position_dependent_friction": [
+            sharp | {"ends_m": end_m}
+            for end_m in (NOWHERE_M, *(centre_m + share * half_m for share in _ENDS))
+            for sharp in smooth[::2]
+        ],
         "dahl_friction": [{"slip_m": s} for s in _SLIPS_M],
         "lugre_friction": [
             {"static_ratio": 1.5, "stribeck_m_per_s": v, "slip_m": s, "bristle_damping_s": 3e-4}

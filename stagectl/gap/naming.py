@@ -1,6 +1,6 @@
 """What was chosen, in words and numbers: effects by name, known parameters by their errors. Pure."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -196,6 +196,7 @@ def parameter_errors(search: Competition, chosen: list[Group], solution: Solutio
 _ALONG_THE_WAY = "position_dependent_friction"
 _DRY_LEVELS = ("level_n", "forward_n", "backward_n")
 _DRIVING_SDS = 3.0
+_ENDED_RATIO = 0.05  # of a level, what one that has ended may be off by
 _DRIVING_SHARE = 0.2
 """Of the way: a friction of 0.9 of its level per 100 mm has ended for the last 15 % of 320 mm."""
 
@@ -204,45 +205,31 @@ def friction_that_drives(named: Sequence[Named], recordings: Sequence[Recording]
     """Return frictions that change along the way by more than all dry friction there is, on much of the way.
 
     A spring that pulls in one direction of motion only is one half of a spring and one half of such a friction: it
-    drives on half of the way. Friction that ends before the way does would drive only behind that place.
+    drives on half of the way.
     """
-    shares = _driving_shares(named, recordings)
-    return tuple(one for one, share, _ in shares if not share <= _DRIVING_SHARE)
+    doubtful = [one for one in named if one.name == _ALONG_THE_WAY]
+    return tuple(one for one in doubtful if not _driving_share(one, named, recordings) <= _DRIVING_SHARE)
 
 
-def friction_that_ends(named: Sequence[Named], recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Say where dry friction ends before the way does: a law that goes on in a straight line drives behind it."""
-    return tuple(
-        f"{title_of(one.name, one.acts_on)}: at {place_m * 1e3:.0f} mm dry friction has ended; behind it, on "
-        f"{100.0 * share:.0f} % of the way, a straight line says that it drives, and the model is off there"
-        for one, share, place_m in _driving_shares(named, recordings)
-        if 0.0 < share <= _DRIVING_SHARE
-    )
-
-
-def _driving_shares(named: Sequence[Named], recordings: Sequence[Recording]) -> Iterator[tuple[Named, float, float]]:
-    """Yield frictions that change along the way, the share of it on which they drive, and where that begins, m."""
-    for one in named:
-        if one.name != _ALONG_THE_WAY:
-            continue
-        axis = "macro" if one.acts_on.startswith("macro") else "end"
-        rows = [row for row in recordings[0].believed.effects if row["acts_on"] == one.acts_on]
-        beside = [other.parameters for other in named if other.acts_on == one.acts_on]
-        slope = one.parameters["slope_n_per_m"] + sum(row["slope_n_per_m"] for row in rows if row["name"] == one.name)
-        level_n = sum(
-            min(float(row[name]) for name in _DRY_LEVELS if name in row)
-            for row in (*rows, *beside)
-            if any(name in row for name in _DRY_LEVELS)
+def _driving_share(one: Named, named: Sequence[Named], recordings: Sequence[Recording]) -> float:
+    """Return the share of the way on which a friction that changes along it drives, beside all dry friction there."""
+    effect, axis = CATALOGUE[one.name], "macro" if one.acts_on.startswith("macro") else "end"
+    beside = [other.parameters for other in named if other is not one and other.acts_on == one.acts_on]
+    rows = [row for row in recordings[0].believed.effects if row["acts_on"] == one.acts_on]
+    levels = ([float(row[name]) for name in _DRY_LEVELS if name in row] for row in (*rows, *beside))
+    beside_n = sum(min(level) for level in levels if level)
+    driving_m = way_m = 0.0
+    for recording in recordings:
+        position_m = recording.position_m(axis)
+        step_m = np.abs(np.diff(position_m))
+        dry_n = beside_n - effect.law(position_m, np.inf, *in_order(effect, one.parameters))
+        slack_n = (
+            _DRIVING_SDS * one.sds["slope_n_per_m"] * np.abs(position_m) + _ENDED_RATIO * one.parameters["level_n"]
         )
-        driving_m = way_m = 0.0
-        for recording in recordings:
-            position_m = recording.position_m(axis)
-            step_m = np.abs(np.diff(position_m))
-            slack_n = _DRIVING_SDS * one.sds["slope_n_per_m"] * np.abs(position_m)
-            drives = ~(level_n + slope * position_m + slack_n >= 0.0)
-            way_m += float(np.sum(step_m))
-            driving_m += float(np.sum(step_m[drives[1:]]))
-        yield one, driving_m / way_m if way_m > 0.0 else 0.0, -level_n / slope if slope else np.inf
+        drives = ~(dry_n + slack_n >= 0.0)
+        way_m += float(np.sum(step_m))
+        driving_m += float(np.sum(step_m[drives[1:]]))
+    return driving_m / way_m if way_m > 0.0 else 0.0
 
 
 def spoken_against(named: Sequence[Named]) -> tuple[str, ...]:

@@ -18,7 +18,6 @@ from stagectl.gap.log import Log
 from stagectl.gap.looks import looked_closely
 from stagectl.gap.naming import (
     friction_that_drives,
-    friction_that_ends,
     parameter_errors,
     refitted_errors,
     second_pitches,
@@ -118,7 +117,6 @@ def _found(
     if unknown is not None:
         unknown["beside"] = [[effect.name, effect.acts_on] for effect in named]
         named = ()
-    ends = friction_that_ends(named, look.search.evidence.recordings)
     refitted = refitted_errors(look.search, look.chosen, solution, believed, widths)
     return Findings(
         profile=believed.name,
@@ -134,7 +132,7 @@ def _found(
         reducible_before=belief.reducible_before(),
         reducible_after=look.search.judge.reducible(look.chosen),
         threshold=judge.threshold,
-        remarks=(*remarks, *ends, *spoken_against(named), *(remark for log in logs for remark in log.remarks)),
+        remarks=(*remarks, *spoken_against(named), *(remark for log in logs for remark in log.remarks)),
         trace=tuple(judge.trace),
         refitted_sds={name: sd for name, (_, sd) in refitted.items()},
         profile_path=believed.path,
