@@ -312,13 +312,17 @@ def test_one_axis_has_forces_of_one_pitch():
     first, second, elsewhere = (
         Named(name, place, {"pitch_m": pitch_m}, {}, gain, gain, ())
         for name, place, pitch_m, gain in (
-            ("cogging", "macro_force", 0.084, 900.0),
-            ("harmonic_cogging", "macro_force", 0.131, 70.0),
+            ("cogging", "macro_force", 0.0084, 900.0),
+            ("harmonic_cogging", "macro_force", 0.0131, 70.0),
             ("cogging", "micro_force", 0.02, 5.0),
         )
     )
-    assert second_pitches([second, elsewhere, first]) == (second,)
-    assert second_pitches([first, elsewhere]) == ()
+    recording = balance.recording_of(_axis_log(_swing(T_S)), AXIS)  # 40 mm
+    assert second_pitches([second, elsewhere, first], [recording]) == (second,)
+    assert second_pitches([first, elsewhere], [recording]) == ()
+    unseen = dataclasses.replace(second, parameters={"pitch_m": 0.03})
+    assert second_pitches([unseen, first], [recording]) == (first, unseen)
+    assert second_pitches([unseen], [recording]) == ()
 
 
 @pytest.mark.parametrize(("foretold_sd_m", "by_sample"), [(28e-9, True), (0.5e-9, False)])

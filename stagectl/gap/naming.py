@@ -245,16 +245,21 @@ def spoken_against(named: Sequence[Named]) -> tuple[str, ...]:
 _OF_ONE_PITCH = ("cogging", "harmonic_cogging")
 
 
-def second_pitches(named: Sequence[Named]) -> tuple[Named, ...]:
+def second_pitches(named: Sequence[Named], recordings: Sequence[Recording]) -> tuple[Named, ...]:
     """Return forces that repeat over a pitch beside a larger one on the same axis: both are one law, of one pitch.
 
     With two pitches, five amplitudes and phases a force that slows down along the way (periodic in the root of the
-    position) is explained to 2 %.
+    position) is explained to 2 %. Where one of the pitches does not fit twice into the way, nobody has seen either
+    repeat: a cable, 200 mm with a harmonic and 64 mm left nothing of a spring with a dead zone, and both are returned.
     """
     found = []
     for place in {one.acts_on for one in named}:
         repeating = [one for one in named if one.acts_on == place and one.name in _OF_ONE_PITCH]
-        found += sorted(repeating, key=lambda one: -one.gain)[1:]
+        if len(repeating) > 1:
+            axis = "macro" if place.startswith("macro") else "end"
+            way_m = max(float(np.ptp(r.position_m(axis))) for r in recordings)
+            are_seen = all(2.0 * one.parameters["pitch_m"] <= way_m for one in repeating)
+            found += sorted(repeating, key=lambda one: -one.gain)[1 if are_seen else 0 :]
     return tuple(found)
 
 

@@ -109,7 +109,8 @@ def _found(
     look = looked_closely(first, unsettled, without, say, crew)
     solution = look.solution or solve([*look.search.judge.base, *look.chosen], look.search.evidence.sums)
     named, widths = without_widths(look.named, look.search)
-    doubtful = (*friction_that_drives(named, look.search.evidence.recordings), *second_pitches(named))
+    seen = look.search.evidence.recordings
+    doubtful = (*friction_that_drives(named, seen), *second_pitches(named, seen))
     gone = {(one.name, one.acts_on) for one in doubtful}
     possible = [group for group in look.chosen if group.key not in gone]
     belief = look.belief or judge
