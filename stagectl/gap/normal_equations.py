@@ -4,6 +4,7 @@ Everything is algebra on one Gram matrix a recording, so hundreds of hypotheses 
 Pure.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -138,9 +139,10 @@ def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
     return total
 
 
-OPEN_SDS = 5.0
-"""Deviations below which a sum of amplitudes is as good as open: above, it foretells more than it spoils even where it
-is 2.5 of them off."""
+OPEN_SDS = math.sqrt(2.0)
+"""Deviations below which a sum of amplitudes is as good as open. One that was found at v of its deviations costs 1 by
+its noise and is worth its true square, v^2 - 1 as far as anybody knows: it foretells more than it spoils from v^2 = 2
+on. From 5 deviations on only, 38 000 squares of wrong masses were not foretold of which all but 1200 could be."""
 
 
 def _foretelling(solution: Solution, fixed: Sequence[int], elsewhere: np.ndarray) -> np.ndarray:
