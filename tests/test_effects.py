@@ -31,7 +31,8 @@ def called(law, arguments, memory: np.ndarray) -> float:
 
 
 def test_every_law_has_numbers_worked_by_hand():
-    assert set(CATALOGUE) == set(WORKED) == set(PARAMETERS)
+    ours = {name for name, known in CATALOGUE.items() if not known.origin}  # a user's own has none
+    assert ours == set(WORKED) == set(PARAMETERS)
 
 
 @pytest.mark.parametrize(("name", "case"), [(name, case) for name, cases in WORKED.items() for case in cases])

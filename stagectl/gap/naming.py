@@ -15,6 +15,7 @@ from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.quantities import along_motion, in_order, quantities
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import power_of_size
+from stagectl.gap.scatter import INEXACT_RATIO
 from stagectl.gap.selection import CONTRADICTION
 from stagectl.gap.settling import settled_by
 
@@ -62,7 +63,10 @@ def measured(
 
 
 def _sized(search: Competition, solution: Solution, group: Group) -> tuple[dict[str, float], dict[str, float], float]:
-    """Return the parameters of an effect, the deviations of those that were solved for, and their common share."""
+    """Return the parameters of an effect, the deviations of those that were solved for, and their common share.
+
+    What no size is known better than is common, too: the mean over five runs is no better.
+    """
     term = search.term(group)
     parameters, slopes = _readable(term, solution, group)
     scale = np.zeros(len(solution.slots))
@@ -70,8 +74,14 @@ def _sized(search: Competition, solution: Solution, group: Group) -> tuple[dict[
         scale = _scale_of_forces(search, solution, term)
     factor = 1.0 + float(scale @ solution.values)
     parameters |= {name: factor * parameters[name] for name in slopes}
-    sds = {name: solution.sd_of(factor * slope + parameters[name] * scale) for name, slope in slopes.items()}
-    return (term.shape | parameters if term.linear else parameters), sds, solution.sd_of(scale)
+    sds = {
+        name: float(
+            np.hypot(solution.sd_of(factor * slope + parameters[name] * scale), INEXACT_RATIO * parameters[name])
+        )
+        for name, slope in slopes.items()
+    }
+    common = float(np.hypot(solution.sd_of(scale), INEXACT_RATIO))
+    return (term.shape | parameters if term.linear else parameters), sds, common
 
 
 _MOTOR_QUANTITIES = {

@@ -25,6 +25,7 @@ from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.operating_point import Moved, operating_point, with_joint_changed
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import LATCH_SDS, power_of_size, whole_of
+from stagectl.gap.scatter import INEXACT_RATIO
 from stagectl.gap.selection import Judge
 
 _EDGE_PASSES = 3
@@ -271,7 +272,9 @@ def remeasured(
         size = values[name]
         before = next(one for one in named if (one.name, one.acts_on) == (effect.name, place))
         parameters = {**values, name: size * (1.0 + float(value[0]))}
-        found.append(replace(before, parameters=parameters, sds={name: abs(size) * float(sd[0])}))
+        found.append(
+            replace(before, parameters=parameters, sds={name: abs(size) * float(np.hypot(sd[0], INEXACT_RATIO))})
+        )
     return tuple(found)
 
 
