@@ -100,7 +100,7 @@ def test_a_strong_effect_is_searched_until_nothing_is_left_and_does_not_raise_th
 
 
 def test_no_size_is_stated_better_than_laws_are_exact():
-    """A vibration of 179 million squares was 2e-4 off in five runs, at a stated 5e-5 of all of them together."""
+    """A vibration of 179 million squares was 2e-4 off in five runs together, at a stated 7e-5."""
     recordings, noise = _recordings(), slow_noise(AXIS, _recordings()[0])
     search = Competition(recordings, 2, noise=noise)
     search.judge.threshold = 30.0

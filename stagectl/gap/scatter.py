@@ -20,7 +20,7 @@ _STRETCHES_S = (0.25, 1.0, 4.0)
 
 INEXACT_RATIO = 3e-4
 """Deviation of any size, as a share of it, by which laws and motion are not exact everywhere alike, which no scatter
-tells: a vibration of 179 million squares was 2e-4 off in all of five runs at a stated 5e-5 together."""
+tells: a vibration of 179 million squares was 2e-4 off in five runs together, at a stated 7e-5."""
 
 _LEAST_STRETCHES = 4
 """Fewer tell nothing of their scatter."""
