@@ -27,7 +27,7 @@ squares of 115 000, and the offset that it mostly is 105 000."""
 
 _BESIDE = 1.5  # of half the travel from its middle: as far as what acts about a place is still said to do so
 
-NOWHERE_M = 10.0
+_NOWHERE_M = 10.0
 """Farther than any travel: where dry friction ends that does not end."""
 
 _ENDS = (0.3, -0.3, 0.7, -0.7)  # of half the travel from its middle
@@ -74,7 +74,7 @@ def grids_for(recordings: Sequence[Recording]) -> Grid:
         "load_dependent_friction": smooth[::2],
         "position_dependent_friction": [
             sharp | {"ends_m": end_m}
-            for end_m in (NOWHERE_M, *(centre_m + share * half_m for share in _ENDS))
+            for end_m in (_NOWHERE_M, *(centre_m + share * half_m for share in _ENDS))
             for sharp in smooth[::2]
         ],
         "dahl_friction": [{"slip_m": s} for s in _SLIPS_M],
