@@ -306,6 +306,10 @@ def test_a_friction_that_changes_along_the_way_does_not_drive_on_much_of_it(
     dry = Named("coulomb_friction", "macro_force", {"level_n": beside_n}, {"level_n": 0.001}, 9.0, 9.0, ())
     elsewhere = dataclasses.replace(dry, acts_on="micro_force", parameters={"level_n": 9.0})
     assert friction_that_drives([along, dry, elsewhere], [recording]) == (along,) * drives
+    known = {"name": along.name, "acts_on": along.acts_on, **along.parameters, "level_n": 0.0, "slope_n_per_m": -4.0}
+    beside = balance.recording_of(_axis_log(_swing(T_S)), dataclasses.replace(AXIS, effects=(known,)))
+    if slope_n_per_m == 4.0:
+        assert friction_that_drives([along], [beside]) == ()  # both together are the same everywhere
 
 
 def test_one_axis_has_forces_of_one_pitch():

@@ -226,13 +226,15 @@ def _driving_share(one: Named, named: Sequence[Named], recordings: Sequence[Reco
     effect, axis = CATALOGUE[one.name], "macro" if one.acts_on.startswith("macro") else "end"
     beside = [other.parameters for other in named if other is not one and other.acts_on == one.acts_on]
     rows = [row for row in recordings[0].believed.effects if row["acts_on"] == one.acts_on]
-    levels = ([float(row[name]) for name in _DRY_LEVELS if name in row] for row in (*rows, *beside))
+    along = [one.parameters, *(row for row in rows if row["name"] == one.name)]
+    others = [*beside, *(row for row in rows if row["name"] != one.name)]
+    levels = ([float(row[name]) for name in _DRY_LEVELS if name in row] for row in others)
     beside_n = sum(min(level) for level in levels if level)
     driving_m = way_m = 0.0
     for recording in recordings:
         position_m = recording.position_m(axis)
         step_m = np.abs(np.diff(position_m))
-        dry_n = beside_n - effect.law(position_m, np.inf, *in_order(effect, one.parameters))
+        dry_n = beside_n - sum(effect.law(position_m, np.inf, *in_order(effect, law)) for law in along)
         slack_n = (
             _DRIVING_SDS * one.sds["slope_n_per_m"] * np.abs(position_m) + _ENDED_RATIO * one.parameters["level_n"]
         )

@@ -412,7 +412,7 @@ def reach_of(recordings: Sequence[Recording], term: Term, name: str, narrow: flo
     if name == "ends_m":
         farthest_m = max(float(np.max(np.abs(r.position_m(_axis(term))))) for r in recordings)
         ends = sorted((at / factor, at * factor)) if abs(at) < farthest_m else [at, at]
-        return ends[0], ends[1]
+        return max(low, ends[0]), min(high, ends[1])
     reach = narrow * _NEAR_ZERO * (high - low)  # of a shape that may be zero, factors lead nowhere
     sized = name == effect.parameters[0] and not term.linear  # found by trials: its sign and its decade are known
     by_factor = sized or abs(at) > reach or low >= 0.0
