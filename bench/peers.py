@@ -344,21 +344,20 @@ def _closed(case: Case, rows: list[dict[str, Any]], refitted: dict[str, float]) 
     for row in case.believed.effects:
         error = refitted.get(f"{row['name']} on {row['acts_on']}", 0.0)
         effects.append({**row, **{name: row[name] * (1.0 + error) for name in CATALOGUE[row["name"]].linear}})
-    mass_ratio = 1.0 + refitted.get("macro_mass_kg", 0.0)
     first, last = case.training[0], (case.held or case.training)[0]
     return (
-        _force_gap_n(case, first, effects + rows, mass_ratio),
-        _force_gap_n(case, last, effects + rows, mass_ratio),
+        _force_gap_n(case, first, effects + rows, refitted),
+        _force_gap_n(case, last, effects + rows, refitted),
     )
 
 
-def _force_gap_n(case: Case, log: Log, effects: list[dict[str, Any]], mass_ratio: float) -> float:
+def _force_gap_n(case: Case, log: Log, effects: list[dict[str, Any]], refitted: dict[str, float]) -> float:
     """Return the force gap of one recording; nan where no controller is known or the simulation runs away."""
     if arbiter.cannot_close(case.believed, log):
         return float("nan")
     try:
         with np.errstate(all="ignore"):
-            return arbiter.gap_of(log, arbiter.simulate(case.believed, effects, log, mass_ratio)).command_n
+            return arbiter.gap_of(log, arbiter.simulate(case.believed, effects, log, refitted)).command_n
     except (StagectlError, ValueError, FloatingPointError):
         return float("nan")
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from stagectl.gap import arbiter
+from stagectl.gap import addition, arbiter
 from stagectl.gap.believed import load_believed
 from stagectl.gap.log import Log
+from stagectl.gap.workflow import find
 
 _DATA = Path(os.environ.get("STAGECTL_DATA", "")) / "emps"
 _NEWTONS_PER_VOLT = 35.1507
@@ -61,3 +62,22 @@ def test_controller_that_ran_is_told_from_another(believed):
         "x", 1e-3, pulses.macro_position_m, pulses.macro_command_n, pulses.valid, "x", reference_m=pulses.reference_m
     )
     assert "other commands than recorded" in arbiter.cannot_close(believed, without)
+
+
+def test_effects_of_the_axis_are_named_from_one_recording_and_hold_on_the_other(believed):
+    """Reversals in passing can't tell dry from sub-linear friction; a rise before standstill would be neither."""
+    log, pulses = _log("DATA_EMPS"), _log("DATA_EMPS_PULSES")
+    findings = find(believed, [log])
+    dry, asymmetric, screw = findings.named
+    names = {dry.name, *(alias[0] for alias in dry.aliases)}
+    assert {"sublinear_viscous_friction", "asymmetric_coulomb_friction", "dahl_friction"} <= names
+    assert "stribeck_friction" not in names
+    assert asymmetric.name == "asymmetric_viscous_friction"
+    assert screw.parameters["pitch_m"] == pytest.approx(2.5e-3, abs=0.02e-3)
+    assert findings.parameter_errors == ()
+    gaps_n = []
+    for one in (log, pulses):
+        effects = addition.effects_with(believed, findings, findings.named, log.session)
+        gaps_n.append(arbiter.gap_of(one, arbiter.simulate(believed, effects, one, findings.refitted)).command_n)
+    assert gaps_n[0] < 1.35
+    assert gaps_n[1] < 2.85

@@ -154,13 +154,13 @@ def _ladder(believed: Believed, findings: Findings, logs: Sequence[Log], voice: 
         if problem:
             voice.note(problem)
             continue
-        mass_ratio = 1.0 + findings.refitted.get("macro_mass_kg", 0.0)
         for name, named in (("before", ()), ("after", findings.named)):
             if name == "before":
-                effects = [dict(row) for row in believed.effects]
+                simulated = arbiter.simulate(believed, [dict(row) for row in believed.effects], log)
             else:
                 effects = addition.effects_with(believed, findings, named, log.session)
-            gap = arbiter.gap_of(log, arbiter.simulate(believed, effects, log, mass_ratio if named else 1.0))
+                simulated = arbiter.simulate(believed, effects, log, findings.refitted)
+            gap = arbiter.gap_of(log, simulated)
             rungs.append({"run": log.name, "with": name, **asdict(gap)})
     return rungs
 

@@ -15,6 +15,7 @@ from stagectl import effect_text
 from stagectl.gap import balance
 from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.hypotheses import Term
+from stagectl.gap.noise import is_low_passed, scale_of
 from stagectl.gap.normal_equations import Group, Sums
 from stagectl.gap.recording import Recording
 
@@ -22,7 +23,6 @@ INNOVATIONS = 0
 """Number of the column that the others are to explain."""
 
 _REST_PASSES = 3
-_HIGH_SHARE = 0.3  # of the sample rate: above it forces move nothing
 _LEAST_SCALE = 0.5
 
 _KEPT_BYTES = 1.6e9
@@ -245,10 +245,9 @@ class Evidence:
 
     def _noise(self, recording: int, channel: int, known_sds: np.ndarray) -> float:
         """Return how large innovations are at the highest frequencies beside known parameters."""
-        left = self.rest(recording, channel, known_sds)
-        power = np.abs(np.fft.rfft(left)) ** 2 / left.size
-        high = np.fft.rfftfreq(left.size) > _HIGH_SHARE
-        return max(float(np.sqrt(np.mean(power[high]))), _LEAST_SCALE)
+        one, axis = self.recordings[recording], self.channels[recording][channel].name
+        low_passed = axis in one.axes and is_low_passed(one, axis)
+        return max(scale_of(self.rest(recording, channel, known_sds), low_passed), _LEAST_SCALE)
 
     def append(self, term: Term, columns: Columns, prior_sds: tuple[float, ...], searched: int) -> Group:
         """Add the columns of a term to all products; returns them as a group."""

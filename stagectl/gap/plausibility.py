@@ -20,6 +20,7 @@ from stagectl.gap.believed import Believed
 from stagectl.gap.effect_forces import effect_forces, known_forces
 from stagectl.gap.forces import Forces
 from stagectl.gap.log import STILL_M, Log, constant_columns
+from stagectl.gap.noise import is_low_passed
 from stagectl.gap.recording import Recording
 
 _BAND_HZ = (0.2, 30.0)
@@ -76,8 +77,7 @@ def check(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> t
     Returns what is worth knowing of those that can.
     """
     remarks = check_logs(believed, training, held)
-    check_recordings(believed, [balance.recording_of(log, believed) for log in [*training, *held]])
-    return remarks
+    return remarks + check_recordings(believed, [balance.recording_of(log, believed) for log in [*training, *held]])
 
 
 def check_logs(believed: Believed, training: Sequence[Log], held: Sequence[Log]) -> tuple[str, ...]:
@@ -95,8 +95,8 @@ def check_logs(believed: Believed, training: Sequence[Log], held: Sequence[Log])
     return tuple(remarks)
 
 
-def check_recordings(believed: Believed, recordings: Sequence[Recording]) -> None:
-    """Refuse motions that the forces beside them don't make; errors as of `check`."""
+def check_recordings(believed: Believed, recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Refuse motions that the forces beside them don't make; errors and values as of `check`."""
     for recording in recordings:
         _check_reference(recording)
     balances = [_balance(recording, axis) for recording in recordings for axis in recording.axes]
@@ -105,6 +105,13 @@ def check_recordings(believed: Believed, recordings: Sequence[Recording]) -> Non
         _check_one(believed, one)
     for axis in recordings[0].axes:
         _check_all(believed, recordings[0], axis, [b for b in balances if b.axis == axis and b.accelerating])
+    return tuple(
+        f"{recording.log.name}: positions of the {axis} were low-passed before they were stored, their sensor's noise "
+        "is gone; what is fast can't be judged there and may seem to be a drive that is late: record them as read"
+        for recording in recordings
+        for axis in recording.axes
+        if is_low_passed(recording, axis)
+    )
 
 
 def _check_columns(log: Log) -> None:

@@ -80,9 +80,10 @@ _PAIR_STARTS_COUNT = 4
 _PART_PASSES = 2
 """Times that each of two laws that replace one is searched beside the other."""
 
-LOW_SPEED_SHARE = 0.02
-"""Of a machine with more force noise than its sensors explain, no friction is an exact law: at speed, where a velocity
-has a sign, dry and sub-linear friction differ by 1.2 % of their gain on a real axis. Slow reversals tell them apart."""
+LOW_SPEED_SHARE = 0.03
+"""Of a machine with more force noise than its sensors explain, no friction is an exact law: where a real axis passes
+through low speeds on its way only, dry friction, bristles and sub-linear friction differ by 1.6 to 2.4 % of their gain,
+and a Stribeck friction by 9 %. Slow reversals tell them apart."""
 
 
 FLOOR_VARIANCE = 3.0
@@ -595,10 +596,9 @@ class Judge:
                 continue
             margin = with_it - self.gain([*rest, other])
             apart = self.distance([*rest, group], [*rest, other])
-            if apart < ALIAS_GAIN or (
-                margin < left
-                and self._is_inexact(group, other, margin / max(gained, 1e-300), _lies_between(margin, apart))
-            ):
+            share = margin / max(gained, 1e-300)
+            inexact = margin < left and share < ALIAS_SHARE and _lies_between(margin, apart)
+            if apart < ALIAS_GAIN or inexact or self._is_rough_friction(group, other, share):
                 margins[other.key] = margin
         return sorted(margins.items(), key=lambda row: row[1])
 
@@ -660,11 +660,10 @@ class Judge:
         gained = self.gain(chosen) - self.gain([other for other in chosen if other is not group])
         return ALIAS_GAIN + SMOOTH_RATIO * gained
 
-    def _is_inexact(self, group: Group, other: Group, share: float, lies_between: bool) -> bool:
-        """Tell whether the share of a gain that two laws differ by may come from laws that are inexact."""
-        if self.is_rough and _shows_at_low_speed(group) and _shows_at_low_speed(other):
-            return share < LOW_SPEED_SHARE
-        return share < ALIAS_SHARE and lies_between
+    def _is_rough_friction(self, group: Group, other: Group, share: float) -> bool:
+        """Tell whether two frictions of a rough machine differ by no more of a gain than such laws are inexact by."""
+        frictions = _shows_at_low_speed(group) and _shows_at_low_speed(other)
+        return self.is_rough and frictions and share < LOW_SPEED_SHARE
 
 
 def _above_floor(sums: Sequence[Sums]) -> float:

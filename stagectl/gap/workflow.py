@@ -96,7 +96,7 @@ def _found(
     say("reading the motion")
     remarks = plausibility.check_logs(believed, training, held)
     unsettled = crew.here(lambda log: balance.recording_of(log, believed), logs)
-    plausibility.check_recordings(believed, unsettled)
+    remarks += plausibility.check_recordings(believed, unsettled)
     noise = noise_of(unsettled)
     recordings, *_ = settled(unsettled, noise, crew=crew)
     first = Competition(
