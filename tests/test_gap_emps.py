@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from stagectl.gap import addition, arbiter
+from stagectl.gap import addition, arbiter, moves, next_move, prediction
 from stagectl.gap.believed import load_believed
 from stagectl.gap.log import Log
 from stagectl.gap.workflow import find
@@ -64,10 +64,15 @@ def test_controller_that_ran_is_told_from_another(believed):
     assert "other commands than recorded" in arbiter.cannot_close(believed, without)
 
 
-def test_effects_of_the_axis_are_named_from_one_recording_and_hold_on_the_other(believed):
+@pytest.fixture(scope="module")
+def findings(believed):
+    """What one of the two recordings shows."""
+    return find(believed, [_log("DATA_EMPS")])
+
+
+def test_effects_of_the_axis_are_named_from_one_recording_and_hold_on_the_other(believed, findings):
     """Reversals in passing can't tell dry from sub-linear friction; a rise before standstill would be neither."""
     log, pulses = _log("DATA_EMPS"), _log("DATA_EMPS_PULSES")
-    findings = find(believed, [log])
     dry, asymmetric, screw = findings.named
     names = {dry.name, *(alias[0] for alias in dry.aliases)}
     assert {"sublinear_viscous_friction", "asymmetric_coulomb_friction", "dahl_friction"} <= names
@@ -81,3 +86,13 @@ def test_effects_of_the_axis_are_named_from_one_recording_and_hold_on_the_other(
         gaps_n.append(arbiter.gap_of(one, arbiter.simulate(believed, effects, one, findings.refitted)).command_n)
     assert gaps_n[0] < 1.35
     assert gaps_n[1] < 2.85
+
+
+def test_slow_reversals_are_asked_for_to_settle_the_low_speed_law(believed, findings):
+    """A planned motion has no noise: read off it as if it were measured, a sine of 3 Hz told seven times as much."""
+    log = _log("DATA_EMPS")
+    library = moves.library(moves.room_of_motion([log.macro_position_m], log.period_s))
+    proposed = next_move.proposals(prediction.evidence(believed, [log], findings), library)
+    asked = {one.name: one for one in proposed}["sublinear_viscous_friction"]
+    assert asked.move.name == "slow reversals"
+    assert ("coulomb_friction", "macro_force") in asked.against

@@ -12,12 +12,14 @@ from stagectl import cli
 from stagectl.commands.opening import home_and_arm
 from stagectl.errors import RequestError
 from stagectl.gap import moves, next_move, prediction
+from stagectl.gap.balance import recording_of, set_noise
 from stagectl.gap.believed import load_believed
 from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.findings_file import FINDINGS, read_findings, write_findings
 from stagectl.gap.log import log_of_rows, read_log
+from stagectl.gap.noise import slow_noise
 from stagectl.gap.planned import planned_log
-from stagectl.gap.predicted_columns import observed, prepared
+from stagectl.gap.predicted_columns import observed
 from stagectl.motion import check
 from stagectl.profile import load_profile
 from stagectl.record import read_run
@@ -162,7 +164,8 @@ def test_every_move_keeps_to_travel_and_limits(stage):
 def test_planned_commands_leave_no_gap(stage, settled):
     """Under the commands that were planned for it a believed machine moves as planned, to within the noise."""
     believed = settled[0]
-    recording = prepared(planned_log(stage[1]["middle stroke"].trajectory, believed), believed)
+    recording = recording_of(planned_log(stage[1]["middle stroke"].trajectory, believed), believed)
+    set_noise(recording, slow_noise(believed, recording))
     z = observed(recording)
     assert np.sqrt(np.mean(z * z)) < 1.0
 

@@ -11,13 +11,14 @@ import numpy as np
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import hypotheses, prediction
-from stagectl.gap.balance import channels
+from stagectl.gap.balance import channels, recording_of, set_noise
 from stagectl.gap.believed import Believed
 from stagectl.gap.findings import Findings, Named
 from stagectl.gap.grids import grids_for
 from stagectl.gap.moves import Move
+from stagectl.gap.noise import slow_noise
 from stagectl.gap.planned import planned_log
-from stagectl.gap.predicted_columns import column, prepared
+from stagectl.gap.predicted_columns import column
 from stagectl.gap.prediction import DETECTED, Evidence, Expected
 
 MOVES: dict[str, tuple[str, ...]] = {
@@ -98,7 +99,8 @@ def excitations(believed: Believed, findings: Findings, moves: Sequence[Move]) -
         return []
     best: dict[str, tuple[float, str]] = {}
     for move in moves:
-        recording = prepared(planned_log(move.trajectory, believed), believed)
+        recording = recording_of(planned_log(move.trajectory, believed), believed)
+        set_noise(recording, slow_noise(believed, recording))
         if not sum(size for _, size in channels(recording)):
             continue
         for term in hypotheses.effect_terms([recording], grids_for([recording])):

@@ -12,15 +12,16 @@ from stagectl.gap.believed import Believed
 from stagectl.gap.effect_forces import effect_forces
 from stagectl.gap.findings import Named
 from stagectl.gap.forces import Forces
+from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
 from stagectl.gap.noise import noise_of
 from stagectl.gap.recording import Recording
 
 
-def prepared(log: Log, believed: Believed) -> Recording:
-    """Prepare a log with the noise that the search begins with."""
+def prepared(log: Log, believed: Believed, noise: dict[str, Noise] | None = None) -> Recording:
+    """Prepare a log with the noise that a search of it begins with, or that of other recordings of its machine."""
     recording = balance.recording_of(log, believed)
-    balance.set_noise(recording, noise_of([recording]))
+    balance.set_noise(recording, noise_of([recording]) if noise is None else noise)
     return recording
 
 
@@ -69,7 +70,7 @@ def effect_columns(recording: Recording, named: Sequence[Named], rest: np.ndarra
 def _part(recording: Recording, effect: Named) -> _Part:
     """Evaluate an effect as found; where its phases are those of homings, at both quadratures."""
     known = CATALOGUE[effect.name]
-    values = _mean_values(effect)
+    values = mean_values(effect)
     pairs = [(name, hypotheses.phase_of(known, name)) for name in known.linear]
     free = [(name, phase) for name, phase in pairs if phase is not None]
     if not free or {parted(name)[1] for name in effect.parameters} == {""}:
@@ -82,7 +83,7 @@ def _part(recording: Recording, effect: Named) -> _Part:
     return _Part(None, tuple(found))
 
 
-def _mean_values(effect: Named) -> dict[str, float]:
+def mean_values(effect: Named) -> dict[str, float]:
     """Return every parameter's value, of those that differ from homing to homing the mean."""
     values: dict[str, list[float]] = {}
     for name, value in effect.parameters.items():

@@ -28,10 +28,12 @@ from stagectl.gap.findings import Findings, Named, ParameterError
 from stagectl.gap.forces import Forces, scaled_forces
 from stagectl.gap.grids import grids_for
 from stagectl.gap.hypotheses import Term
+from stagectl.gap.innovations import Noise
 from stagectl.gap.log import Log
+from stagectl.gap.noise import noise_of
 from stagectl.gap.predicted_columns import (
-    _mean_values,
     effect_columns,
+    mean_values,
     observed,
     prepared,
     stacked_columns,
@@ -124,6 +126,7 @@ class Evidence:
     """What the recordings of some findings say, ready to predict others."""
 
     believed: Believed
+    noise: dict[str, Noise]
     named: tuple[Named, ...]
     wrong: tuple[ParameterError, ...]
     base: list[tuple[Term, float]]
@@ -155,6 +158,7 @@ def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evi
     wrong = findings.parameter_errors if findings.unknown is None else ()  # beside an unknown force nothing is sure
     if not named and not wrong:
         raise RequestError("these findings name no effect that could be predicted; `next` shows what to excite")
+    noise = noise_of([balance.recording_of(log, believed) for log in logs])
     recordings = [prepared(log, believed) for log in logs]
     base = hypotheses.parameter_terms(recordings[0])
     base_values = np.array([findings.refitted.get(term.name, 0.0) for term, _ in base])
@@ -191,7 +195,7 @@ def evidence(believed: Believed, logs: Sequence[Log], findings: Findings) -> Evi
         (one.name, one.acts_on): _rivals(one, named, terms, base_columns, prior, base_values, blocks, filters)
         for one in named
     }
-    seen = Evidence(believed, named, wrong, base, base_values, filters, model, rivals, late_ratio, np.zeros(0))
+    seen = Evidence(believed, noise, named, wrong, base, base_values, filters, model, rivals, late_ratio, np.zeros(0))
     seen.scatter = np.array([_scatter(white, values, seen.along(target)) for target in seen.targets])
     return seen
 
@@ -203,7 +207,7 @@ def expected(seen: Evidence, log: Log) -> list[Expected]:
     """
     late = np.random.default_rng(0).random(log.samples_count) < seen.late_ratio
     log = replace(log, valid=log.valid & ~late)
-    recording = prepared(log, seen.believed)
+    recording = prepared(log, seen.believed, seen.noise)  # a planned motion has none that could be read off it
     nothing = np.zeros(sum(size for _, size in balance.channels(recording)))
     raw = seen.model.columns(recording, nothing)
     d = whitened_rest(recording, raw, seen.filters)
@@ -317,7 +321,7 @@ def _size(recording: Recording, target: Named | ParameterError, seen: Evidence) 
     """Return (unit, rms) of what a target adds along a motion: a force, or the error of a reading."""
     if isinstance(target, Named):
         known = CATALOGUE[target.name]
-        values = _mean_values(target)
+        values = mean_values(target)
         forces = effect_forces(recording, known, target.acts_on, [values[name] for name in known.parameters])
     else:
         forces = Forces()
