@@ -17,7 +17,7 @@ from stagectl.gap.forces import Forces, add_forces
 from stagectl.gap.grids import grids_for
 from stagectl.gap.log import Log
 from stagectl.gap.motion import motion_of, motion_under
-from stagectl.gap.naming import friction_that_drives, refitted_errors, second_pitches
+from stagectl.gap.naming import ending, friction_that_drives, refitted_errors, second_pitches
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group, solve
 from stagectl.gap.operating_point import operating_point, with_joint_changed
@@ -310,6 +310,32 @@ def test_a_friction_that_changes_along_the_way_does_not_drive_on_much_of_it(
     beside = balance.recording_of(_axis_log(_swing(T_S)), dataclasses.replace(AXIS, effects=(known,)))
     if slope_n_per_m == 4.0:
         assert friction_that_drives([along], [beside]) == ()  # both together are the same everywhere
+
+
+@pytest.mark.parametrize(
+    ("slope_n_per_m", "ends_m", "expected_m"),
+    [
+        (-4.0, 10.0, 0.025),
+        (4.0, 10.0, -0.025),
+        (-4.0, 0.01, 0.01),
+        (-6.0, 10.0, 10.0),
+        (0.001, 10.0, 10.0),
+        (0, 10, 10),
+    ],
+)
+def test_a_friction_that_falls_along_the_way_ends_beyond_what_was_recorded(slope_n_per_m, ends_m, expected_m):
+    """20 mm to both sides were recorded. 0.1 N is nothing at 25 mm for 4 N/m, within what was recorded for 6 N/m."""
+    recording = balance.recording_of(_axis_log(_swing(T_S)), AXIS)
+    shape = {"slope_n_per_m": slope_n_per_m, "ends_m": ends_m, "smoothing_m_per_s": 1e-5}
+    along = Named("position_dependent_friction", "macro_force", {"level_n": 0.1, **shape}, {}, 9.0, 9.0, ())
+    (found,) = ending([along], [recording])
+    assert found.parameters["ends_m"] == pytest.approx(expected_m)
+    law = CATALOGUE["position_dependent_friction"].law
+    values = [[one.parameters[name] for name in ("level_n", *shape)] for one in (along, found)]
+    before_n, after_n = (law(_swing(T_S), 1.0, *value) for value in values)
+    assert np.array_equal(before_n, after_n)
+    if expected_m != ends_m:
+        assert law(np.array([-1.0, 1.0]), 1.0, *values[1]).max() <= 0.0  # it never drives
 
 
 def test_one_axis_has_forces_of_one_pitch():

@@ -244,6 +244,32 @@ def _driving_share(one: Named, named: Sequence[Named], recordings: Sequence[Reco
     return driving_m / way_m if way_m > 0.0 else 0.0
 
 
+def ending(named: Sequence[Named], recordings: Sequence[Recording]) -> tuple[Named, ...]:
+    """Return names in which a friction that falls along the way ends where it is nothing, beyond what was recorded.
+
+    Where nobody recorded its end, its straight line would go on: from there on a model, and a feedforward, drives.
+    """
+    return tuple(_ending(one, recordings) if one.name == _ALONG_THE_WAY else one for one in named)
+
+
+def _ending(one: Named, recordings: Sequence[Recording]) -> Named:
+    low_m, high_m = _recorded_m(one, recordings)
+    level_n, slope_n_per_m, ends_m = (one.parameters[name] for name in ("level_n", "slope_n_per_m", "ends_m"))
+    nothing_m = -level_n / slope_n_per_m if slope_n_per_m else np.inf
+    is_seen = low_m < ends_m < high_m
+    is_beyond = nothing_m > max(high_m, 0.0) or nothing_m < min(low_m, 0.0)
+    if is_seen or not is_beyond or not abs(nothing_m) < abs(ends_m):
+        return one
+    return replace(one, parameters={**one.parameters, "ends_m": float(nothing_m)})
+
+
+def _recorded_m(one: Named, recordings: Sequence[Recording]) -> tuple[float, float]:
+    """Return from where to where the body was recorded that an effect acts on."""
+    axis = "macro" if one.acts_on.startswith("macro") else "end"
+    positions_m = [recording.position_m(axis) for recording in recordings]
+    return min(float(x.min()) for x in positions_m), max(float(x.max()) for x in positions_m)
+
+
 def spoken_against(named: Sequence[Named]) -> tuple[str, ...]:
     """Say of which names recordings that no fit saw are explained worse than without, by more than noise."""
     return tuple(

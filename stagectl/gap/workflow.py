@@ -17,6 +17,7 @@ from stagectl.gap.left_over import excess, unknown_rest
 from stagectl.gap.log import Log
 from stagectl.gap.looks import looked_closely
 from stagectl.gap.naming import (
+    ending,
     friction_that_drives,
     parameter_errors,
     refitted_errors,
@@ -124,7 +125,7 @@ def _found(
         runs=tuple(log.name for log in training),
         holdout=tuple(log.name for log in held),
         verdict="unknown" if unknown is not None else "found" if named else "nothing",
-        named=named,
+        named=ending(named, seen),
         parameter_errors=parameter_errors(look.search, look.chosen, solution) + widths,
         refitted={name: value for name, (value, _) in refitted.items()},
         not_excited=first.not_excited(),
