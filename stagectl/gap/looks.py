@@ -49,6 +49,25 @@ class Look(NamedTuple):
     belief: Judge | None = None  # of what the belief leaves, in units of this look's noise
 
 
+class _Case(NamedTuple):
+    """What every look at the same recordings is taken of."""
+
+    first: Competition
+    unsettled: Sequence[Recording]  # before the joint's edges were put where they are
+    without: frozenset[str]
+    crew: Crew
+
+
+class _Course(NamedTuple):
+    """What the next look is taken under, and what was learnt on the way there."""
+
+    known: Look
+    plain: Look  # what is told in the first competition
+    compared: frozenset[tuple[str, str]]  # beside which names the forms of what moves readings were told apart
+    moved: tuple[Moved, ...] = ()
+    refused: frozenset[tuple[str, str]] = frozenset()
+
+
 def looked_closely(
     first: Competition,
     unsettled: Sequence[Recording],
@@ -60,61 +79,92 @@ def looked_closely(
 
     unsettled: the recordings before the joint's edges were put where they are.
     """
+    case = _Case(first, unsettled, without, crew)
     found = first.judge.select(until=lambda group: moves_joint(first, group))
-    look = plain = _told_anew(Look(first, found, all_named(first, found)), unsettled, crew)
-    known, moved = plain, ()
-    refused: frozenset[tuple[str, str]] = frozenset()
-    compared = _keys(plain)  # beside which names the forms of what moves readings were told apart
+    look = _told_anew(Look(first, found, all_named(first, found)), unsettled, crew)
+    course = _Course(look, look, _keys(look))
     for _ in range(_CLOSER_LOOKS):
-        if not known.chosen and not moved:
+        if not course.known.chosen and not course.moved:
             break
         say("once more, along the motion and at the place where the joint is now known to be")
-        search = _under(known, moved, first, unsettled, without, refused, crew)
-        chosen = search.judge.select(search.judge.reshaped(search.kept), until=lambda group: group.is_slope)
-        solution = solve([*search.judge.base, *chosen], search.evidence.sums)
-        at_size = remeasured(search, solution, known.named, search.moved) if search.moved else ()
-        look = Look(search, chosen, at_size + all_named(search, chosen))
-        if (
-            search.judge.lacks_a_name(chosen)
-            and not any(moves_joint(search, group) for group in chosen)
-            and unknown_rest(search, chosen, excess(belief_under(first, search, crew), []))
-        ):
-            break  # no further look gives it one
-        gone = {(one.name, one.acts_on) for one in at_size if not stands(one, search.evidence.recordings[0])}
-        if gone:  # at its size it is nothing
-            if known.search is not first:
-                refused |= gone
-            moved = tuple(one for one in moved if (one[0].name, one[1]) not in gone)
-            left = [group for group in known.chosen if group.key not in gone]
-            named = tuple(one for one in known.named if (one.name, one.acts_on) not in gone)
-            look = known = Look(known.search, left, named)
-            plain = known if known.search is first else plain
-        elif any(group.is_slope for group in chosen):
-            look = known = _told_anew(look, unsettled, crew)
-            moved = moved_now(search, known.chosen)  # both at their sizes
-        elif _is_otherwise(look, known):
-            known, moved = look, moved_now(search, look.chosen)
-        elif _keys(look) > compared and (anew := _again_in(first, plain, look, unsettled, crew)) is not None:
-            compared = _keys(look)
-            if _keys(anew) != compared:
-                look = known = plain = anew
-                moved = ()
-                continue
-            look = _with_forms_of(look, anew)
-            if not any(is_taken_at_size(search, group) for group in chosen):
-                break
-            known, moved = look, moved_now(search, chosen)
-        elif any(is_taken_at_size(search, group) for group in chosen):
-            look = known = _told_anew(look, unsettled, crew)
-            moved = moved_now(search, known.chosen)
-        else:
+        look, at_size = _taken(case, course)
+        if _is_unknown(case, look):
+            break  # no further look gives it a name
+        look, further = _without_nothing(case, course, look, at_size) or _further(case, course, look)
+        if further is None:
             break
+        course = further
     belief = belief_under(first, look.search, crew)
     if unknown_rest(look.search, look.chosen, excess(belief, [])) and not unknown_rest(
-        first, plain.chosen, excess(first.judge, [])
+        first, course.plain.chosen, excess(first.judge, [])
     ):
-        look, belief = plain, first.judge  # the first look had reached the floor
+        look, belief = course.plain, first.judge  # the first look had reached the floor
     return _measured(look)._replace(belief=belief)
+
+
+def _taken(case: _Case, course: _Course) -> tuple[Look, tuple[Named, ...]]:
+    """Return the next look, and those of its names that are part of the operating point."""
+    search = _under(course.known, course.moved, case.first, case.unsettled, case.without, course.refused, case.crew)
+    chosen = search.judge.select(search.judge.reshaped(search.kept), until=lambda group: group.is_slope)
+    solution = solve([*search.judge.base, *chosen], search.evidence.sums)
+    at_size = remeasured(search, solution, course.known.named, search.moved) if search.moved else ()
+    return Look(search, chosen, at_size + all_named(search, chosen)), at_size
+
+
+def _is_unknown(case: _Case, look: Look) -> bool:
+    """Tell whether what is left lacks a name, with the joint in its place."""
+    search = look.search
+    return (
+        search.judge.lacks_a_name(look.chosen)
+        and not any(moves_joint(search, group) for group in look.chosen)
+        and unknown_rest(search, look.chosen, excess(belief_under(case.first, search, case.crew), [])) is not None
+    )
+
+
+_Told = tuple[Look, _Course | None]
+"""A look as it is told, and what the next one is taken under; None where it is the last."""
+
+
+def _without_nothing(case: _Case, course: _Course, look: Look, at_size: tuple[Named, ...]) -> _Told | None:
+    """Return the look before, without what at its size is nothing; None where all of it is something."""
+    known = course.known
+    gone = {(one.name, one.acts_on) for one in at_size if not stands(one, look.search.evidence.recordings[0])}
+    if not gone:
+        return None
+    is_first = known.search is case.first
+    left = [group for group in known.chosen if group.key not in gone]
+    known = Look(known.search, left, tuple(one for one in known.named if (one.name, one.acts_on) not in gone))
+    return known, course._replace(
+        known=known,
+        plain=known if is_first else course.plain,
+        moved=tuple(one for one in course.moved if (one[0].name, one[1]) not in gone),
+        refused=course.refused if is_first else course.refused | gone,
+    )
+
+
+def _further(case: _Case, course: _Course, look: Look) -> _Told:
+    """Return how a look is told, and what the next one is taken under where it has to be another one."""
+    search, chosen = look.search, look.chosen
+    is_at_size = any(is_taken_at_size(search, group) for group in chosen)
+    if any(group.is_slope for group in chosen):
+        return _at_their_sizes(case, course, look)
+    if _is_otherwise(look, course.known):
+        return look, course._replace(known=look, moved=moved_now(search, chosen))
+    if _keys(look) > course.compared:
+        anew = _again_in(case.first, course.plain, look, case.unsettled, case.crew)
+        if anew is not None:
+            course = course._replace(compared=_keys(look))
+            if _keys(anew) != course.compared:
+                return anew, course._replace(known=anew, plain=anew, moved=())
+            look = _with_forms_of(look, anew)
+            return look, course._replace(known=look, moved=moved_now(search, chosen)) if is_at_size else None
+    return _at_their_sizes(case, course, look) if is_at_size else (look, None)
+
+
+def _at_their_sizes(case: _Case, course: _Course, look: Look) -> _Told:
+    """Return a look told anew, under which all is at its size."""
+    told = _told_anew(look, case.unsettled, case.crew)
+    return told, course._replace(known=told, moved=moved_now(look.search, told.chosen))
 
 
 _ALONG_ITSELF = frozenset({Trait.FIRST_ORDER, Trait.SWINGS})
@@ -214,8 +264,9 @@ def _scatter(one: Left, other: Left) -> float:
     return LEFT_SDS * float(np.sqrt(2.0 * abs(one.count - other.count)))
 
 
-def _keys(look: Look) -> set[tuple[str, str]]:
-    return {group.key for group in look.chosen} | {(effect.name, place) for effect, place, _ in look.search.moved}
+def _keys(look: Look) -> frozenset[tuple[str, str]]:
+    at_size = {(effect.name, place) for effect, place, _ in look.search.moved}
+    return frozenset(group.key for group in look.chosen) | at_size
 
 
 def _again_in(first: Competition, plain: Look, look: Look, unsettled: Sequence[Recording], crew: Crew) -> Look | None:
