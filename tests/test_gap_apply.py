@@ -282,6 +282,9 @@ def test_an_unknown_curve_becomes_a_table_without_a_name():
     timely = dataclasses.replace(findings, unknown=CURVE | {"over": "t_s"})
     with pytest.raises(RequestError, match="over t_s: it is of one recording"):
         applied(_text(AXIS), timely, candidates=True, date=DATE)
+    turning = dataclasses.replace(findings, unknown=CURVE | {"over": "since_reversal_s"})
+    with pytest.raises(RequestError, match="over since_reversal_s: no table of a profile goes by it"):
+        applied(_text(AXIS), turning, candidates=True, date=DATE)
 
 
 def test_comments_survive_where_values_stand_in_one_line():

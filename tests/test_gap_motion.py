@@ -24,6 +24,7 @@ from stagectl.gap.operating_point import operating_point, with_joint_changed
 from stagectl.gap.quantities import quantities
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner
+from stagectl.gap.reversals import since_reversal
 from stagectl.gap.settling import settled_by
 
 H, MASS_KG, NOISE_M = 1e-3, 40.0, 5e-9
@@ -310,6 +311,18 @@ def test_a_friction_that_changes_along_the_way_does_not_drive_on_much_of_it(
     beside = balance.recording_of(_axis_log(_swing(T_S)), dataclasses.replace(AXIS, effects=(known,)))
     if slope_n_per_m == 4.0:
         assert friction_that_drives([along], [beside]) == ()  # both together are the same everywhere
+
+
+def test_a_body_turned_round_where_it_was_farthest():
+    """1 mm there, back and there again in 1, 2 and 1 s; 20 nm of noise are no reversal."""
+    t_s = 1e-3 * np.arange(4000)
+    triangle_m = 1e-3 * np.interp(t_s, [0.0, 1.0, 3.0, 4.0], [0.0, 1.0, -1.0, 0.0])
+    read_m = triangle_m + 20e-9 * np.random.default_rng(1).uniform(-1.0, 1.0, t_s.size)
+    since_s, direction = since_reversal(read_m, 0.4e-6, 1e-3)
+    for at_s, expected_s, way in ((0.5, 0.5, 1.0), (1.5, 0.5, -1.0), (2.9, 1.9, -1.0), (3.25, 0.25, 1.0)):
+        assert since_s[round(1e3 * at_s)] == pytest.approx(expected_s, abs=2e-3)
+        assert direction[round(1e3 * at_s)] == way
+    assert not np.any(since_reversal(20e-9 * np.sin(t_s), 0.4e-6, 1e-3)[1])  # held still
 
 
 @pytest.mark.parametrize(

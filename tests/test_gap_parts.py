@@ -18,7 +18,7 @@ from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.forces import Forces
 from stagectl.gap.hypotheses import widest_amplitudes
 from stagectl.gap.innovations import moments
-from stagectl.gap.left_over import is_kinked, one_curve_for_many
+from stagectl.gap.left_over import finer_curve, one_curve_for_many
 from stagectl.gap.log import Log, log_of_rows
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
@@ -426,10 +426,12 @@ def test_one_elimination_gives_what_solving_anew_gives():
 
 
 @functools.cache
-def _axis_log(name: str, friction_n: float, seed: int, n: int = 8000, ripple_n: float = 0.0) -> Log:
+def _axis_log(
+    name: str, friction_n: float, seed: int, n: int = 8000, ripple_n: float = 0.0, growing_n: float = 0.0
+) -> Log:
     """An axis under a spring-like controller of its own, with forces that nobody is told of.
 
-    friction_n: dry; ripple_n: over 4.36 mm, an eleventh of the way.
+    friction_n: dry; ripple_n: over 4.36 mm, an eleventh of the way; growing_n: dry, within 0.1 s of each reversal.
     """
     random = np.random.default_rng(seed)
     parts = 20
@@ -438,12 +440,15 @@ def _axis_log(name: str, friction_n: float, seed: int, n: int = 8000, ripple_n: 
     speed = np.gradient(reference, H)
     x, v, seen, command = reference[0], speed[0], np.zeros(n), np.zeros(n)
     slow = _slow_force(random, n, 1.34)
+    since_s, was = 0.0, v
     for k in range(n):
+        since_s = since_s + H if v * was > 0.0 else 0.0
+        was, dry_n = v, friction_n + growing_n * (1.0 - math.exp(-since_s / 0.1))
         seen[k] = x + 5e-9 * random.standard_normal()
         command[k] = 4.0e4 * (reference[k] - seen[k]) + 2.5e3 * (speed[k] - v)
         for _ in range(parts):
             x += 0.5 * v * H / parts
-            hidden = friction_n * math.tanh(v / 1e-4) + ripple_n * math.sin(1441.0 * x)
+            hidden = dry_n * math.tanh(v / 1e-4) + ripple_n * math.sin(1441.0 * x)
             v += (command[k] - hidden - 30.0 * v + slow[k]) / MASS * H / parts
             x += 0.5 * v * H / parts
     return Log(name, H, seen, command, np.ones(n, bool), "1", reference_m=reference)
@@ -476,9 +481,12 @@ def test_hidden_dry_friction_is_named_and_nothing_where_nothing_is_missing(frict
 LEAST_SQUARES = 500.0
 
 
-@pytest.mark.parametrize(("ripple_n", "is_found"), [(0.5, True), (0.0, False)])
-def test_what_twelve_knots_over_position_do_not_find_forty_eight_do(ripple_n, is_found):
-    log = _axis_log("run 1", 1.0, 1, ripple_n=ripple_n)
+@pytest.mark.parametrize(
+    ("hidden", "over"),
+    [({"ripple_n": 0.5}, "curve over position_m"), ({"growing_n": 0.8}, "curve over since_reversal_s"), ({}, None)],
+)
+def test_what_twelve_knots_do_not_find_a_finer_curve_does(hidden, over):
+    log = _axis_log("run 1", 1.0, 1, **hidden)
     recordings = [balance.recording_of(log, _believed())]
     search = Competition(recordings, 1, noise=noise_of(recordings))
     friction = max(
@@ -487,7 +495,8 @@ def test_what_twelve_knots_over_position_do_not_find_forty_eight_do(ripple_n, is
     )
     gained = (search.judge.gain([friction, curve]) - search.judge.gain([friction]) for curve in search.curves)
     assert max(gained) < LEAST_SQUARES
-    assert is_kinked(search, [friction], LEAST_SQUARES) == is_found
+    found = finer_curve(search, [friction], LEAST_SQUARES)
+    assert (found and search.term(found).name) == over
 
 
 @functools.cache

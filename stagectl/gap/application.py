@@ -105,7 +105,8 @@ def _write_table(sheet: Sheet, unknown: Mapping[str, Any]) -> None:
     over = unknown["over"]
     name = next((table for table, quantity in TABLES.items() if quantity == over), None)
     if name is None:
-        sheet.left.append(f"the unknown curve over {over}: it is of one recording, a profile can't hold it")
+        why = "it is of one recording, a profile can't hold it" if over == "t_s" else "no table of a profile goes by it"
+        sheet.left.append(f"the unknown curve over {over}: {why}")
         return
     knots = unknown["knots"]
     step = (knots[-1] - knots[0]) / (len(knots) - 1)

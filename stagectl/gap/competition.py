@@ -136,8 +136,9 @@ class Competition:
         return [found[asked[group.columns]] if group.columns in asked else 0.0 for group in groups]
 
     def fine_curves(self) -> list[Group]:
-        """Return tables over position with finer steps than those that compete."""
-        terms = list(hypotheses.fine_curve_terms(self.evidence.recordings))
+        """Return tables over position with finer steps than those that compete, and over time since a reversal."""
+        recordings = self.evidence.recordings
+        terms = [*hypotheses.fine_curve_terms(recordings), *hypotheses.reversal_curve_terms(recordings)]
         columns = self._crew.here(self.evidence.columns_of, terms)
         added = [Added(term, one, widest_amplitudes(term), 0) for term, one in zip(terms, columns, strict=True)]
         return self.evidence.append_all(added)

@@ -154,6 +154,7 @@ _QUANTITIES = {
     "velocity_m_per_s": (1e3, "velocity (mm/s)"),
     "relative_position_m": (1e6, "end minus macro (µm)"),
     "t_s": (1.0, "time (s)"),
+    "since_reversal_s": (1.0, "time since the last reversal (s)"),
 }
 
 
