@@ -42,10 +42,13 @@ def recording_of(
     return foretold_under(rough, known_forces(rough))
 
 
-def foretold_under(recording: Recording, forces: Forces, found: Forces | None = None) -> Recording:
+def foretold_under(
+    recording: Recording, forces: Forces, found: Forces | None = None, found_reaction_ratio: float = 0.0
+) -> Recording:
     """Return a recording with the motion that follows from its past, forces and sensor errors that are thought to act.
 
-    found: what of these drives a share of the mass that swings, besides what is believed.
+    found: what of these drives a share of the mass that swings, besides what is believed; found_reaction_ratio: the
+    share of whatever changes the micro's motor force that pushes the macro back, besides what is believed.
     """
     log, believed = recording.log, recording.believed
     motions: list[Motion | None] = [None, None]
@@ -62,6 +65,7 @@ def foretold_under(recording: Recording, forces: Forces, found: Forces | None = 
         recording.at_size, recording.late, recording.edges_out_m,
     )  # fmt: skip
     there.found = recording.found if found is None else found
+    there.found_reaction_ratio = found_reaction_ratio
     return there
 
 

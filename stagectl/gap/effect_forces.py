@@ -8,7 +8,7 @@ from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
 from stagectl.gap.late_readings import makes_late
 from stagectl.gap.quantities import along_motion, arguments_of, quantities
 from stagectl.gap.reading_errors import SMALL_M, misread, more_contact_n, reading_error_m
-from stagectl.gap.recording import Recording, contact_push_n, driven_by, relative_motion, with_late
+from stagectl.gap.recording import REACTION, Recording, contact_push_n, driven_by, relative_motion, with_late
 
 
 def known_forces(recording: Recording, but: Trait | None = None) -> Forces:
@@ -55,6 +55,9 @@ def _exchanged(recording: Recording) -> Forces:
         if row["acts_on"] in ("contact", "joint") or "micro_motor_force_n" in effect.quantities:
             values = [row[name] for name in effect.parameters]
             add_forces(total, effect_forces(recording, effect, row["acts_on"], values))
+    if recording.found_reaction_ratio:
+        found = [recording.found_reaction_ratio]
+        add_forces(total, effect_forces(recording, CATALOGUE[REACTION], "macro_force", found))
     return total
 
 

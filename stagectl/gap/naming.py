@@ -124,7 +124,9 @@ def _scale_of_forces(search: Competition, solution: Solution, term: Term) -> np.
         weights |= {"left_stiffness_n_per_m": share - 1.0, "right_stiffness_n_per_m": -share}
     for quantity in quantities:
         motor = _MOTOR_QUANTITIES.get(quantity)
-        if motor is not None:
+        # where a reaction was found, what the micro's force constant is off by pushes the macro back already
+        told = motor == "micro" and search.evidence.recordings[0].found_reaction_ratio != 0.0
+        if motor is not None and not told:
             power = 1.0 if term.linear else _power_of_motor(search, term, quantity)
             weights[f"{side if motor == 'own' else motor}_force_constant"] = -power
     if weights and not term.linear:

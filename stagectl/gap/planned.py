@@ -9,6 +9,7 @@ from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.effect_forces import known_forces
 from stagectl.gap.forces import Forces
 from stagectl.gap.log import Log
+from stagectl.gap.recording import REACTION
 from stagectl.trajectory import Trajectory
 
 
@@ -31,7 +32,7 @@ def planned_log(planned: Trajectory, believed: Believed) -> Log:
     )  # fmt: skip
     others = _others(still, believed)
     micro_n = believed.micro.mass_kg * acceleration - others.end_n
-    reaction = sum(row["fraction_ratio"] for row in believed.effects if row["name"] == "micro_reaction")
+    reaction = sum(row["fraction_ratio"] for row in believed.effects if row["name"] == REACTION)
     macro_acceleration = acceleration - _means(rows["relative_acceleration_m_per_s2"])
     macro_n = believed.macro.mass_kg * macro_acceleration - others.macro_n + reaction * micro_n
     return _with_commands(still, believed, macro_n, micro_n)

@@ -16,6 +16,8 @@ from stagectl.gap.late_readings import Row
 from stagectl.gap.log import Log
 from stagectl.gap.motion import Motion, motion_of
 
+REACTION = "micro_reaction"
+
 AXES = ("macro", "end")
 """Bodies; the second one is the micro's, its position the end's."""
 
@@ -46,6 +48,7 @@ class Recording:
     late: tuple[Row, ...] = ()  # effects that make readings those of earlier instants
     edges_out_m: EdgesOut = (0.0, 0.0)
     found: Forces = field(default_factory=Forces)  # of effects that were found, of which none is part of the above
+    found_reaction_ratio: float = 0.0  # share of the micro's motor force that was found to push the macro back
     exchanged: dict[str, Forces] = field(default_factory=dict)  # without what is late of one sensor, once asked for
     others_n: dict[str, np.ndarray] = field(default_factory=dict)  # on a body, without what swings, once asked for
     pushed_n: dict[float, np.ndarray] = field(default_factory=dict)  # by the contact, by damping, once asked for
@@ -58,8 +61,9 @@ class Recording:
 
     @property
     def reaction_ratio(self) -> float:
-        """Share of the micro's motor force that is believed to push the macro back."""
-        return sum(row["fraction_ratio"] for row in self.believed.effects if row["name"] == "micro_reaction")
+        """Share of the micro's motor force that pushes the macro back, as believed and as found."""
+        believed = sum(row["fraction_ratio"] for row in self.believed.effects if row["name"] == REACTION)
+        return believed + self.found_reaction_ratio
 
     @property
     def contact_damping_n_s_per_m(self) -> float:

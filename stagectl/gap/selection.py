@@ -4,12 +4,14 @@ A term stays when it gains on all recordings together more than the best of the 
 of what is reducible at all, and when recordings that no fit saw do not speak against it. Pure.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+from scipy.stats import chi2
 
 from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap.normal_equations import Fold, Group, Sums, covers, held_out_gain, solve, within_bounds
@@ -545,11 +547,17 @@ class Judge:
     def _threshold_of(self, group: Group) -> float:
         """Return what a hypothesis has to gain to stand out of noise, searched shapes included.
 
-        What a known parameter does is exact, and its stated uncertainty is paid for by its prior.
+        What a known parameter does is exact, and its stated uncertainty is paid for by its prior: what it gains beyond
+        that is chi square of one number, and the largest of all parameters counts. By what the best of the library
+        gains on noise an error of 5.5 deviations, half of which the mass took, was none (15 squares of 25).
         """
         if group.key[1] == "parameter":
-            return self.threshold
+            return self._parameter_threshold()
         return NAMING_RATIO * self.threshold + SEARCH_PRICE * group.searched
+
+    def _parameter_threshold(self) -> float:
+        """Return the quantile of what the best known parameter gains beyond its prior where all are as stated."""
+        return _largest_chi_square(sum(group.key[1] == "parameter" for group in self.library))
 
     def _admissible(self, start: Sequence[Group]) -> list[Group]:
         """Take hypotheses back, the least useful first, until every amplitude is one that its effect can have.
@@ -561,7 +569,9 @@ class Judge:
         while chosen:
             without = [[other for other in chosen if other is not group] for group in chosen]
             rest = max(without, key=self.gain)
-            if self._allowed(chosen) and self.gain(chosen) - self.gain(rest) > self.threshold:
+            (weakest,) = (group for group in chosen if group not in rest)
+            least = self._parameter_threshold() if weakest.key[1] == "parameter" else self.threshold
+            if self._allowed(chosen) and self.gain(chosen) - self.gain(rest) > least:
                 break
             chosen = rest
         return chosen
@@ -664,6 +674,12 @@ class Judge:
         """Tell whether two frictions of a rough machine differ by no more of a gain than such laws are inexact by."""
         frictions = _shows_at_low_speed(group) and _shows_at_low_speed(other)
         return self.is_rough and frictions and share < LOW_SPEED_SHARE
+
+
+@functools.cache
+def _largest_chi_square(count: int) -> float:
+    """Return the quantile of the largest of so many squares of one deviation each."""
+    return float(chi2.ppf(NULL_QUANTILE ** (1.0 / max(count, 1)), 1))
 
 
 def _above_floor(sums: Sequence[Sums]) -> float:
