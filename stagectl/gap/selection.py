@@ -299,7 +299,7 @@ class Judge:
         A mass and a force constant that are both wrong: each alone is a compromise that recordings speak against.
         """
         now = self.gain(chosen)
-        hopeful = [group for group in rivals if self.gain([*chosen, group]) - now > self._threshold_of(group)]
+        hopeful = [group for group in rivals if self.gain([*chosen, group]) - now > self._threshold_of(chosen, group)]
         standing = [
             list(two)
             for two in itertools.combinations(hopeful, 2)
@@ -321,7 +321,7 @@ class Judge:
         now = self.gain(chosen)
         grown = []
         for group in rivals:
-            if not _has_akin(chosen, group) or self.gain([*chosen, group]) - now <= self._threshold_of(group):
+            if not _has_akin(chosen, group) or self.gain([*chosen, group]) - now <= self._threshold_of(chosen, group):
                 continue
             anew = self.reshaped([*chosen, group])
             if not self.leaves_curve(anew) and self._allowed(anew) and self.foretold(anew) > self.foretold(chosen):
@@ -488,7 +488,9 @@ class Judge:
         gained = whole - self.gain(chosen)
         if gained <= least and gained > self._inexact(chosen, whole) and self._is_exact_with(chosen, group):
             least = 0.0
-        enough = max(self._threshold_of(group), least, self.price() * group.complexity, AT_SIZE_RATIO * self.at_size)
+        enough = max(
+            self._threshold_of(chosen, group), least, self.price() * group.complexity, AT_SIZE_RATIO * self.at_size
+        )
         return gained > enough and self._foretells(chosen, [group])
 
     def _inexact(self, chosen: Sequence[Group], whole: float) -> float:
@@ -544,19 +546,23 @@ class Judge:
             return True
         return self.foretold([*chosen, *more]) - self.foretold(chosen) > -CONTRADICTION
 
-    def _threshold_of(self, group: Group) -> float:
-        """Return what a hypothesis has to gain to stand out of noise, searched shapes included.
+    def _threshold_of(self, chosen: Sequence[Group], group: Group) -> float:
+        """Return what a hypothesis has to gain beside `chosen` to stand out of noise, searched shapes included.
 
-        What a known parameter does is exact, and its stated uncertainty is paid for by its prior: what it gains beyond
-        that is chi square of one number, and the largest of all parameters counts. By what the best of the library
-        gains on noise an error of 5.5 deviations, half of which the mass took, was none (15 squares of 25).
+        What a known parameter does is exact, and its stated uncertainty is paid for by its prior.
         """
-        if group.key[1] == "parameter":
-            return self._parameter_threshold()
-        return NAMING_RATIO * self.threshold + SEARCH_PRICE * group.searched
+        if group.key[1] != "parameter":
+            return NAMING_RATIO * self.threshold + SEARCH_PRICE * group.searched
+        is_alone = not chosen and not self.at_size
+        return self._threshold_of_parameters() if is_alone else self.threshold
 
-    def _parameter_threshold(self) -> float:
-        """Return the quantile of what the best known parameter gains beyond its prior where all are as stated."""
+    def _threshold_of_parameters(self) -> float:
+        """Return what a known parameter has to gain beyond its prior where no effect is found beside it.
+
+        All as stated, each gains a chi square of one number, and the largest of them counts: by what the best of the
+        whole library gains on noise an error of 5.5 deviations, half of which the mass took, was none (15 squares of
+        25). Beside effects, laws are not that exact: a spring of the joint that gained 12 was 23 deviations off.
+        """
         return _largest_chi_square(sum(group.key[1] == "parameter" for group in self.library))
 
     def _admissible(self, start: Sequence[Group]) -> list[Group]:
@@ -570,7 +576,7 @@ class Judge:
             without = [[other for other in chosen if other is not group] for group in chosen]
             rest = max(without, key=self.gain)
             (weakest,) = (group for group in chosen if group not in rest)
-            least = self._parameter_threshold() if weakest.key[1] == "parameter" else self.threshold
+            least = min(self.threshold, self._threshold_of(rest, weakest))
             if self._allowed(chosen) and self.gain(chosen) - self.gain(rest) > least:
                 break
             chosen = rest
