@@ -89,7 +89,7 @@ def test_effects_of_the_axis_are_named_from_one_recording_and_hold_on_the_other(
 
 
 def test_slow_reversals_are_asked_for_to_settle_the_low_speed_law(believed, findings):
-    """A planned motion has no noise: read off it as if it were measured, a sine of 3 Hz told 40 times as much."""
+    """A planned motion has no noise: read off it as if it were measured, a sine of 3 Hz told 28 times as much."""
     log = _log("DATA_EMPS")
     library = moves.library(moves.room_of_motion([log.macro_position_m], log.period_s))
     proposed = next_move.proposals(prediction.evidence(believed, [log], findings), library)
