@@ -81,7 +81,7 @@ def simulate(
     """Run a believed machine with these effects under its own controller along a log's reference.
 
     refitted: errors of what is believed of the motor and its drive, by the names that findings have for them. Without
-    the 0.27 ms that a drive turned out to be late a machine was off by 1.54 N, with them by 1.34 N.
+    the 0.27 ms that a drive turned out to be late a machine was off by 1.54 N, with them by 1.35 N.
 
     Errors: RequestError where controller or reference are not known.
     """
