@@ -88,8 +88,8 @@ class StageState:
         """Publish where things stand, and feed the watchdog as long as the servo's cycles, or else this loop, go on."""
         self._heed_record_requests()
         self._look_at_joint()
-        self._say_news()
         status = self.show()
+        self._say_news()  # once the status has it: who hears of it looks there
         self._notifier.feed(status.health.cycles_count if self._stage is not None else time.monotonic_ns())
 
     def show(self) -> messages.Status:
