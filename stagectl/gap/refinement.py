@@ -34,6 +34,7 @@ _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one tu
 _ANCHOR_M = 1.0
 _MOVED_PLACE_M = 0.1  # any: between two places a law about a place is a straight line
 _NEAR_ZERO = 0.05
+_END = "ends_m"
 LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)
 _LEAST_ASKED = 0.02
@@ -116,8 +117,8 @@ class Refiner:
             free = tuple(dict.fromkeys((*CATALOGUE[term.name].parameters[:1], *free)))
         if Trait.PLACED in CATALOGUE[term.name].traits:
             return self._at_its_place(term), len(free)
+        term, best = self._ended(term)
         shape = dict(term.shape)
-        best = self._gain(term)
         for sweep in range(_MOST_SWEEPS):
             before = best
             for name in free:
@@ -135,6 +136,21 @@ class Refiner:
             least = stated_s / found.shape[CATALOGUE[found.name].parameters[0]]
             found = replace(found, bounds=((max(found.bounds[0][0], least), found.bounds[0][1]),))
         return found, len(free) - (0 if found.linear else 1)
+
+    def _ended(self, term: Term) -> tuple[Term, float]:
+        """Return a term, and its gain, with an end where its straight line is nothing, if recordings go on from there.
+
+        A search from an end beyond the travel leads nowhere. One 30 mm from the travel's 320 gained 0.04 % more beyond
+        it than at the nearest place of the grid, and was 2 % too large with its line driving from there on.
+        """
+        best = self._gain(term)
+        if _END not in term.shape or abs(term.shape[_END]) < _farthest_m(self._evidence.recordings, term):
+            return term, best
+        level, slope = self._amplitudes(self._evidence.columns_of(term), term)
+        if not abs(level) < abs(slope) * _farthest_m(self._evidence.recordings, term):
+            return term, best
+        ended = with_shape(term, {_END: float(-level / slope)})
+        return max((term, best), (ended, self._gain(ended)), key=lambda found: found[1])
 
     def _at_its_place(self, term: Term) -> Term:
         """Return a law that acts about a place at the place that is asked for: size, and size times place, are factors.
@@ -409,15 +425,19 @@ def reach_of(recordings: Sequence[Recording], term: Term, name: str, narrow: flo
         reach = narrow * _ANCHOR_M
         return max(low, at - reach), min(high, at + reach)
     factor = _BRACKET**narrow
-    if name == "ends_m":
-        farthest_m = max(float(np.max(np.abs(r.position_m(_axis(term))))) for r in recordings)
-        ends = sorted((at / factor, at * factor)) if abs(at) < farthest_m else [at, at]
+    if name == _END:
+        ends = sorted((at / factor, at * factor)) if abs(at) < _farthest_m(recordings, term) else [at, at]
         return max(low, ends[0]), min(high, ends[1])
     reach = narrow * _NEAR_ZERO * (high - low)  # of a shape that may be zero, factors lead nowhere
     sized = name == effect.parameters[0] and not term.linear  # found by trials: its sign and its decade are known
     by_factor = sized or abs(at) > reach or low >= 0.0
     ends = sorted((at / factor, at * factor)) if by_factor else (at - reach, at + reach)
     return max(low, ends[0]), min(high, ends[1])
+
+
+def _farthest_m(recordings: Sequence[Recording], term: Term) -> float:
+    """Return how far from zero a term's body was recorded, m."""
+    return max(float(np.max(np.abs(r.position_m(_axis(term))))) for r in recordings)
 
 
 def whole_of(term: Term) -> bool:
