@@ -25,8 +25,6 @@ _ANCHORS = (0.0, 0.5, -0.5, 1.5, -1.5, 5.0, -5.0)
 plane of pull at rest and stiffness. From the middle alone one that was anchored beside the travel did not rank: 32 000
 squares of 115 000, and the offset that it mostly is 105 000."""
 
-_BESIDE = 1.5  # of half the travel from its middle: as far as what acts about a place is still said to do so
-
 _NOWHERE_M = 10.0
 """Farther than any travel: where dry friction ends that does not end."""
 
@@ -45,10 +43,14 @@ def _recorded_travel_m(recordings: Sequence[Recording]) -> tuple[float, float]:
     return centre_m, 0.5 * max(float(np.ptp(r.log.macro_position_m)) for r in recordings)
 
 
-def near_travel_m(recordings: Sequence[Recording]) -> tuple[float, float]:
-    """Return from where to where a law may act that acts about a place beside the travel: half as far again."""
+def along_travel_m(recordings: Sequence[Recording]) -> tuple[float, float]:
+    """Return from where to where a law may act that acts about a place: over the travel, about what was recorded.
+
+    A cable is anchored where the stage goes. One whose anchor may lie half the travel beyond it was 5.4 squares from an
+    offset that stood 600 out of the noise, and no recording can tell them apart.
+    """
     centre_m, half_m = _recorded_travel_m(recordings)
-    reach_m = _BESIDE * max(half_m, 0.5 * recordings[0].believed.travel_m)
+    reach_m = max(half_m, 0.5 * recordings[0].believed.travel_m)
     return centre_m - reach_m, centre_m + reach_m
 
 

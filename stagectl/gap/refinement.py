@@ -16,7 +16,7 @@ from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import hypotheses
 from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.forces import squares_of
-from stagectl.gap.grids import free_shapes, near_travel_m
+from stagectl.gap.grids import free_shapes, along_travel_m
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.late_readings import makes_late
 from stagectl.gap.normal_equations import Group, Placed, active_slots, covers, normal_of
@@ -464,11 +464,11 @@ def with_shape(term: Term, changed: dict[str, float]) -> Term:
 
 
 def nearest_place(recordings: Sequence[Recording], term: Term) -> Term:
-    """Return a law that acts about a place at the one nearest to it that is not far from the travel; others as are."""
+    """Return a law that acts about a place at the one nearest to it along the travel; others as are."""
     if term.acts_on == "parameter" or Trait.PLACED not in CATALOGUE[term.name].traits:
         return term
     (name,) = free_shapes(CATALOGUE[term.name])
-    low_m, high_m = near_travel_m(recordings)
+    low_m, high_m = along_travel_m(recordings)
     place_m = float(np.clip(term.shape[name], low_m, high_m))
     return term if place_m == term.shape[name] else with_shape(term, {name: place_m})
 

@@ -602,7 +602,7 @@ class Judge:
     def aliases(self, chosen: Sequence[Group], group: Group) -> list[tuple[tuple[str, str], float]]:
         """Return the keys that would do as well as `group` beside the others, with the margin that they lose by.
 
-        What acts about a place does so from near the travel: anchored ten metres away, a cable is an offset, whose set
+        What acts about a place does so from along the travel: anchored ten metres away, a cable is an offset, whose set
         it was named in.
         """
         rest = [other for other in chosen if other is not group]
