@@ -201,7 +201,9 @@ def _periodic_terms(evidence: Evidence, known_sds: np.ndarray, all_sds: np.ndarr
     """Make terms of pitches and frequencies that stand out.
 
     Of what all other hypotheses (`all_sds`) leave, above its neighbours; pitches also of what known parameters alone
-    leave, above noise: laws and curves together have a part of every pitch that is not much shorter than the way.
+    leave, above noise: laws and curves together have a part of every pitch that is not much shorter than the way. And
+    frequencies that are lines in that: what a shaking base does, the motor counteracts, so that to a command that is
+    late it is no stranger. A vibration of 0.3 million squares was no peak in what all hypotheses left.
     """
     recordings = evidence.recordings
     random = np.random.default_rng(_SEED)
@@ -219,6 +221,7 @@ def _periodic_terms(evidence: Evidence, known_sds: np.ndarray, all_sds: np.ndarr
         driven = seeds.pitches_m(recordings, axis, left_driven)
         driven += seeds.pitches_m(recordings, axis, unknown_driven, noise_driven)
         frequencies = seeds.frequencies_hz(recordings, axis, left)
+        frequencies += seeds.frequencies_hz(recordings, axis, unknown, seeds.LINE_RATIO)
         found += hypotheses.periodic_terms(recordings, axis, pitches, driven, frequencies)
     return found
 

@@ -14,6 +14,7 @@ from stagectl.gap.recording import Recording
 PEAKS_COUNT = 4
 _CELLS_PER_PITCH = 6.0
 _LEAST_PITCH_M = 4e-4
+LINE_RATIO = 50.0  # of the power of a line over time to its neighbours; the highest place of noise has 20
 _LOWEST_HZ = 2.5
 _HIGHEST_HZ = 120.0
 _NEIGHBOURS = 41
@@ -95,20 +96,30 @@ def _over_position(
     return power
 
 
-def frequencies_hz(recordings: Sequence[Recording], axis: str, signals: list[np.ndarray]) -> list[float]:
-    """Return the frequencies with the highest peaks over time, Hz."""
+def frequencies_hz(
+    recordings: Sequence[Recording], axis: str, signals: list[np.ndarray], least_ratio: float = 0.0
+) -> list[float]:
+    """Return the frequencies with the highest peaks over time, Hz; least_ratio: of their power to their neighbours'."""
     period_s = recordings[0].log.period_s
     count = int(2 ** np.ceil(np.log2(2 * max(s.size for s in signals))))
     power = np.zeros(count // 2 + 1)
     for signal in signals:
         power += np.abs(np.fft.rfft(signal, count)) ** 2
-    return _peaks(power, 1.0 / (count * period_s), _LOWEST_HZ, _HIGHEST_HZ)
+    return _peaks(power, 1.0 / (count * period_s), _LOWEST_HZ, _HIGHEST_HZ, least_ratio=least_ratio)
 
 
 def _peaks(
-    power: np.ndarray, step: float, low: float, high: float, background: np.ndarray | None = None
+    power: np.ndarray,
+    step: float,
+    low: float,
+    high: float,
+    background: np.ndarray | None = None,
+    least_ratio: float = 0.0,
 ) -> list[float]:
-    """Return the places of the highest peaks above a background, their neighbourhood's median, in units of `step`."""
+    """Return the places of the highest peaks above a background, their neighbourhood's median, in units of `step`.
+
+    None of those that are lower than `least_ratio` times the background.
+    """
     first, last = max(int(np.ceil(low / step)), 2), min(int(high / step), power.size - 2)
     if last - first < _NEIGHBOURS:
         return []
@@ -121,6 +132,8 @@ def _peaks(
     height = part / np.maximum(below, 1e-300)
     found: list[float] = []
     for k in np.argsort(-height):
+        if height[k] < least_ratio:
+            break
         here = first + int(k)
         if all(abs(here - f / step) > 3.0 for f in found):
             a, b, c = power[here - 1], power[here], power[here + 1]
