@@ -16,7 +16,7 @@ from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import hypotheses
 from stagectl.gap.evidence import Columns, Evidence
 from stagectl.gap.forces import squares_of
-from stagectl.gap.grids import free_shapes, along_travel_m
+from stagectl.gap.grids import along_travel_m, free_shapes
 from stagectl.gap.hypotheses import Term
 from stagectl.gap.late_readings import makes_late
 from stagectl.gap.normal_equations import Group, Placed, active_slots, covers, normal_of
