@@ -84,6 +84,33 @@ def test_a_wide_line_stands_out_of_noise_and_not_of_its_neighbours():
     assert abs(seeds._peaks(power, 1.0, 2.0, 390.0, np.ones(400))[0] - 60) <= 30
 
 
+def test_a_line_is_far_above_its_neighbours_and_no_place_of_noise_is():
+    random = np.random.default_rng(4)
+    power = random.exponential(size=8000)
+    assert seeds._peaks(power, 1.0, 2.0, 7990.0, least_ratio=seeds.LINE_RATIO) == []
+    power[3000:3003] += 400.0
+    (place,) = seeds._peaks(power, 1.0, 2.0, 7990.0, least_ratio=seeds.LINE_RATIO)
+    assert place == pytest.approx(3001.0, abs=2.0)
+
+
+def test_friction_that_ends_within_the_travel_is_found_at_its_end_from_a_line_that_does_not():
+    """0.5 N at zero, nothing from -20 mm on; the stage goes on to -50 mm, where the straight line would drive."""
+
+    def rubbed_n(command_n: float, x: float, v: float) -> float:
+        return command_n - max(0.5 + 25.0 * x, 0.0) * np.tanh(v / 1e-4)
+
+    recordings = [balance.recording_of(axis_under(rubbed_n, seed), AXIS) for seed in (1, 2)]
+    for recording in recordings:
+        balance.set_noise(recording, slow_noise(AXIS, recording))
+    evidence = Evidence(recordings)
+    evidence.finish(np.zeros(0), 0, 0)
+    straight = {"smoothing_m_per_s": 1e-4, "ends_m": 10.0}
+    term = hypotheses.term_of(CATALOGUE["position_dependent_friction"], "macro_force", straight)
+    outcome = Refiner(evidence, []).refined(term)
+    assert outcome is not None
+    assert outcome[0].shape["ends_m"] == pytest.approx(-0.02, abs=2e-4)
+
+
 def test_a_strong_effect_is_searched_until_nothing_is_left_and_does_not_raise_the_noise():
     """Of millions of squares a pitch that is 1e-4 off leaves a rest, and a noise read off beside it hides."""
     recordings, noise = _recordings(), slow_noise(AXIS, _recordings()[0])

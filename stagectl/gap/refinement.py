@@ -34,7 +34,7 @@ _PITCH_SPANS = 0.6  # a pitch moves by so many of what turns its phase by one tu
 _ANCHOR_M = 1.0
 _MOVED_PLACE_M = 0.1  # any: between two places a law about a place is a straight line
 _NEAR_ZERO = 0.05
-_END = "ends_m"
+_ALONG_THE_WAY, _END = "position_dependent_friction", "ends_m"
 LATCH_SDS = 2.0
 _STEPS = (0.3, 1.0, 3.0)
 _LEAST_ASKED = 0.02
@@ -144,10 +144,13 @@ class Refiner:
         it than at the nearest place of the grid, and was 2 % too large with its line driving from there on.
         """
         best = self._gain(term)
-        if _END not in term.shape or abs(term.shape[_END]) < _farthest_m(self._evidence.recordings, term):
+        if term.name != _ALONG_THE_WAY:
+            return term, best
+        farthest_m = _farthest_m(self._evidence.recordings, term)
+        if abs(term.shape[_END]) < farthest_m:
             return term, best
         level, slope = self._amplitudes(self._evidence.columns_of(term), term)
-        if not abs(level) < abs(slope) * _farthest_m(self._evidence.recordings, term):
+        if not abs(level) < abs(slope) * farthest_m:
             return term, best
         ended = with_shape(term, {_END: float(-level / slope)})
         return max((term, best), (ended, self._gain(ended)), key=lambda found: found[1])
