@@ -46,8 +46,8 @@ def _recorded_travel_m(recordings: Sequence[Recording]) -> tuple[float, float]:
 def along_travel_m(recordings: Sequence[Recording]) -> tuple[float, float]:
     """Return from where to where a law may act that acts about a place: over the travel, about what was recorded.
 
-    A cable is anchored where the stage goes. With an anchor half the travel beyond it one gained 5.4 squares of 385 less
-    than the offset that there was, and they were one set.
+    A cable is anchored where the stage goes. With an anchor half the travel beyond it one gained 5.4 squares of 385
+    less than the offset that there was, and they were one set.
     """
     centre_m, half_m = _recorded_travel_m(recordings)
     reach_m = max(half_m, 0.5 * recordings[0].believed.travel_m)
