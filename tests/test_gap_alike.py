@@ -90,12 +90,22 @@ def test_an_offset_is_no_cable_from_ten_metres_away():
     assert [key[0] for key, _ in search.judge.aliases([found], found)] == ["gravity_tilt"]
 
 
-def test_bristles_leave_what_smooth_laws_do():
-    """By 0.05 % of what they gain a lag of a drive beside them was taken for what their law is inexact by."""
-    judge = _search(_bristled(2.0, 1.0, 0.0)).judge
+def _rubbed(level_n: float) -> Callable[[], Made]:
+    return lambda: lambda command_n, x, v: command_n - level_n * float(np.sign(v)) * (abs(v) / 0.1) ** 0.43
+
+
+@pytest.mark.parametrize("made_n", [_bristled(2.0, 1.0, 0.0), _rubbed(6.0)])
+def test_frictions_leave_what_smooth_laws_do(made_n):
+    """By 0.05 % of what they gain a lag of a drive, or a cubic spring, was taken for what their law is inexact by.
+
+    Another friction of the body still is: one along the way was named beside bristles.
+    """
+    search = _search(made_n)
+    judge = search.judge
     (found,) = judge.select()
-    whole = judge.gain([found])
-    assert judge._inexact([found], whole) < 0.1 * EXACT_RATIO * (whole - judge.gain([]))
+    gained = judge.gain([found]) - judge.gain([])
+    assert judge._inexact([found], _of_library(search, "cubic_stiffness")) < 0.1 * EXACT_RATIO * gained
+    assert judge._inexact([found], _of_library(search, "position_dependent_friction")) > 0.9 * EXACT_RATIO * gained
 
 
 def test_dahls_law_is_found_where_lugres_gains_what_noise_does():
