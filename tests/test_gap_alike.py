@@ -108,6 +108,34 @@ def test_frictions_leave_what_smooth_laws_do(made_n):
     assert judge._inexact([found], _of_library(search, "position_dependent_friction")) > 0.9 * EXACT_RATIO * gained
 
 
+def _shaken() -> Made:
+    """Make friction, and a force that sweeps upwards from 20 Hz, which no law of the library is."""
+    steps = np.zeros(1)
+
+    def made_n(command_n: float, x: float, v: float) -> float:
+        steps[0] += 1.0
+        t = steps[0] * H / STEPS
+        return _rubbed(6.0)()(command_n, x, v) + 0.012 * float(np.sin(2.0 * np.pi * (20.0 + 0.3 * t) * t))
+
+    return made_n
+
+
+def _rippled() -> Made:
+    return lambda command_n, x, v: _rubbed(6.0)()(command_n * (1.0 + 1e-3 * np.sin(2.0 * np.pi * x / 15e-3)), x, v)
+
+
+@pytest.mark.parametrize(("made_n", "stays"), [(_shaken, False), (_rippled, True)])
+def test_what_explains_a_small_part_of_what_is_left_is_no_name(made_n, stays):
+    """Beside a friction and a mode that left 4300 squares a base that shakes at the mode's frequency gained 286."""
+    search = _search(made_n)
+    judge = search.judge
+    friction = next(g for g in judge.rivals([]) if g.key[0] == "sublinear_viscous_friction")
+    (ripple,) = (group for group in judge.rivals([friction]) if group.key[0] == "current_ripple")
+    assert judge.gain([friction, ripple]) - judge.gain([friction]) > 2.0 * judge._threshold_of([friction], ripple)
+    judge.curves = []  # a table over position finds some of the sweep, too
+    assert judge._is_exact_with([friction], ripple) == stays
+
+
 def test_dahls_law_is_found_where_lugres_gains_what_noise_does():
     """Of bristles that hold no more at rest it has three numbers for nothing."""
     search = _search(_bristled(2.0, 1.0, 0.0))
