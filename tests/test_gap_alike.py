@@ -216,3 +216,13 @@ def test_no_name_is_dropped_where_forms_are_told_apart_beside_all_names(monkeypa
     again = looks._again_in(search, first, closer, [], Serial())
     assert again is not None
     assert {group.key for group in again.chosen} == {lag.key, spring.key}
+
+
+def test_one_law_at_two_places_and_two_laws_at_one_are_compared_at_their_sizes(monkeypatch):
+    """As a column a scale error of the other sensor gained 421 squares of 207 000 more than the one that there was."""
+    monkeypatch.setattr(looks, "moves_readings", lambda search, group: True)
+    search = _search(_pulled_by(60.0, 0.0))
+    found = Group(("scale_error", "macro_sensor"), (0,), "structural", (1.0,))
+    others = [("scale_error", "end_sensor"), ("sensor_lag", "macro_sensor"), ("sensor_lag", "end_sensor"), found.key]
+    forms = [looks._is_other_form(search, found, Group(key, (1,), "structural", (1.0,))) for key in others]
+    assert forms == [True, True, False, False]

@@ -80,13 +80,3 @@ def test_a_lag_is_told_from_a_delay_beside_all_names(tmp_path):
         ("command_delay", "macro_command"),
         ("cable_spring", "macro_force"),
     }
-
-
-def test_a_scale_error_is_the_one_of_the_two_sensors_that_leaves_less_at_its_size(tmp_path):
-    """Of 1080 ppm of the macro's sensor one of the end's gained 421 squares of 207 000 more, as a column."""
-    case = generate.draw(2855, "multi", 8.0)
-    generate.write(case, tmp_path)
-    blind = load_set(tmp_path)
-    findings = find(blind.believed, list(blind.logs)[:RUNS_COUNT], [], nulls_count=20)
-    names = {(one.name, one.acts_on) for one in findings.named}
-    assert names == {("scale_error", "macro_sensor"), ("cable_hysteresis", "macro_force")}
