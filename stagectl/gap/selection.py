@@ -754,7 +754,7 @@ def _is_smooth(group: Group) -> bool:
 
 
 def _is_friction(group: Group) -> bool:
-    """Tell whether a law of the library, none of a user's own, is a friction that turns with the direction of motion."""
+    """Tell whether a law of the library, none of a user's own, is a friction that turns with the direction."""
     known = CATALOGUE.get(group.key[0])
     return known is not None and not known.origin and (known.has_step or _shows_at_low_speed(group))
 
