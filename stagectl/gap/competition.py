@@ -74,6 +74,10 @@ class Competition:
         self.judge.curves = self.curves
         self.judge.brought_near = self._brought_near
         self.judge.modelled = self._modelled()
+        axes = [recordings[0].belief(axis) for axis in recordings[0].axes]
+        self.judge.scale_sd_ratio = max(
+            float(np.hypot(b.mass_sd_kg / b.mass_kg, b.force_constant_sd_ratio)) for b in axes
+        )
         self.judge.is_rough = any(level.white_force_n > 0.0 for level in noise.values())
 
     def _modelled(self) -> float:

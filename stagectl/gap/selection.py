@@ -133,6 +133,7 @@ class Judge:
         0.0  # what laws of the model explain already that are known to be inexact, in squares of the noise
     )
     at_size: float = 0.0  # what laws explain that are part of the operating point, in squares of the noise
+    scale_sd_ratio: float = 0.0  # what masses and force constants are believed to be uncertain by
     is_rough: bool = False  # a force noise besides that of the sensors
     trace: list[str] = field(default_factory=list)
     _known_rivals: dict[frozenset[tuple[int, ...]], list[Group]] = field(default_factory=dict)
@@ -468,7 +469,7 @@ class Judge:
 
     def _allowed(self, groups: Sequence[Group]) -> bool:
         """Tell whether every amplitude is one that its effect can have."""
-        return within_bounds(solve([*self.base, *groups], self.source.sums))
+        return within_bounds(solve([*self.base, *groups], self.source.sums), self.scale_sd_ratio)
 
     def _competed(self, chosen: list[Group]) -> list[Group]:
         """Let each hypothesis compete again beside the others: what came first need not be true."""
