@@ -16,7 +16,15 @@ from stagectl.gap.noise import Explained
 from stagectl.gap.normal_equations import Group, Sums, solve
 from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
-from stagectl.gap.refinement import Refiner, but_for_size, counts_at_size, gain_at_size, nearest_place, refined
+from stagectl.gap.refinement import (
+    Refiner,
+    but_for_size,
+    counts_at_size,
+    gain_at_size,
+    nearest_place,
+    refined,
+    with_shape,
+)
 from stagectl.gap.selection import Judge
 
 _EXCITED_GAIN = 1e-6
@@ -147,15 +155,27 @@ class Competition:
         added = [Added(term, one, widest_amplitudes(term), 0) for term, one in zip(terms, columns, strict=True)]
         return self.evidence.append_all(added)
 
-    def _brought_near(self, group: Group) -> Group:
-        """Return a law that acts about a place no farther from the travel than the grid has it beside it."""
-        term = self.term(group)
+    def _brought_near(self, other: Group, group: Group) -> list[Group]:
+        """Return a law at the shapes at which it may be what `group` says.
+
+        What acts about a place is no farther from the travel than the grid has it beside it; the same law elsewhere may
+        have the same shape.
+        """
+        term, named = self.term(other), self.term(group)
         near = nearest_place(self.evidence.recordings, term)
-        if near is term:
-            return group
-        (columns,) = self._crew.here(self.evidence.columns_of, [near])
-        (found,) = self.evidence.append_all([Added(near, columns, group.prior_sds, group.searched)])
+        found = [other] if near is term else self._appended([near], other)
+        if term.name == named.name and term.linear == named.linear:
+            size = CATALOGUE[term.name].parameters[0] if term.name in CATALOGUE else ""
+            shape = named.shape
+            if size in shape:  # what one reads too much the other reads too little
+                shape = shape | {size: float(np.copysign(shape[size], term.shape[size]))}
+            found += self._appended([with_shape(term, shape)], other) if shape != term.shape else []
         return found
+
+    def _appended(self, terms: list[Term], like: Group) -> list[Group]:
+        columns = self._crew.here(self.evidence.columns_of, terms)
+        added = [Added(*one, like.prior_sds, like.searched) for one in zip(terms, columns, strict=True)]
+        return self.evidence.append_all(added)
 
     def term(self, group: Group) -> Term:
         """Return what a group stands for."""

@@ -125,8 +125,8 @@ class Judge:
     library: list[Group]
     refine: Refine
     gains_at_size: GainsAtSize
-    brought_near: Callable[[Group], Group] = lambda group: group
-    """A law that acts about a place far from the travel -> the same at the nearest one beside it; others stay."""
+    brought_near: Callable[[Group, Group], Sequence[Group]] = lambda other, group: (other,)
+    """(law, name that it may be an alias of) -> the same law at the shapes at which it may be that."""
     curves: list[Group] = field(default_factory=list)
     threshold: float = 0.0
     modelled: float = (
@@ -615,7 +615,8 @@ class Judge:
         """Return the keys that would do as well as `group` beside the others, with the margin that they lose by.
 
         What acts about a place does so from along the travel: anchored ten metres away, a cable is an offset, whose set
-        it was named in.
+        it was named in. The same law elsewhere does so at the same shape: a drift of the end's sensor over 52 s and one
+        of the macro's over 36 s were 10 squares apart, over 52 s both are one.
         """
         rest = [other for other in chosen if other is not group]
         with_it = self.gain(chosen)
@@ -623,11 +624,16 @@ class Judge:
         left = self._left_at_most(chosen)
         margins: dict[tuple[str, str], float] = {}
         taken = {other.key for other in chosen}
-        for other in map(self.brought_near, self.rivals(rest)):
-            if other.key in taken or _form(other) > _form(group) or not self._allowed([*rest, other]):
+        for rival in self.rivals(rest):
+            if rival.key in taken or _form(rival) > _form(group):
                 continue
+            forms = [one for one in self.brought_near(rival, group) if self._allowed([*rest, one])]
+            if not forms:
+                continue
+            distances = [self.distance([*rest, group], [*rest, one]) for one in forms]
+            apart = min(distances)
+            other = forms[distances.index(apart)]
             margin = with_it - self.gain([*rest, other])
-            apart = self.distance([*rest, group], [*rest, other])
             share = margin / max(gained, 1e-300)
             inexact = margin < left and share < ALIAS_SHARE and _lies_between(margin, apart)
             if apart < ALIAS_GAIN or inexact or self._is_rough_friction(group, other, share):

@@ -479,8 +479,10 @@ class Evidence:
     def alternatives(self, hints=()):
         """Every library law at every place, over a grid of its parameters: (name, acts_on, signed, columns, at_size).
 
-        hints: effects whose pitches and frequencies join the grids of the periodic laws. at_size: where columns don't
-        grow with the law's size alone, (what gives its column at a size, a middle size); else None.
+        hints: effects whose pitches and frequencies join the grids of the periodic laws, and whose shape that of the
+        same law elsewhere: a drift of the macro's sensor over 36 s and one of the end's seemed 3.7 apart, as the grid
+        has 20 s and 77 s. at_size: where columns don't grow with the law's size alone, (what gives its column at a
+        size, a middle size); else None.
         """
         for law in laws.LIBRARY:
             if self.case.single and not law.single_axis:
@@ -511,6 +513,11 @@ class Evidence:
         for parameter in law.parameters[1:]:
             if all(parameter.name not in point for point in points) and "phase" not in parameter.spread:
                 points = [point | {parameter.name: math.sqrt(parameter.low * parameter.high)} for point in points]
+        points += [
+            {p.name: hint.values[p.name] for p in law.parameters[1:] if "phase" not in p.spread}
+            for hint in hints
+            if hint.law.name == law.name and len(law.parameters) > 1
+        ]
         phase = next((parameter for parameter in law.parameters if "phase" in parameter.spread), None)
         moves_edges = not self.case.single and (law.family == "sensor" or law.name in EDGE_LAWS)
         for size in sizes:
