@@ -105,9 +105,9 @@ def solve(groups: Sequence[Group], sums: Sequence[Sums], fixed: Sequence[int] = 
 def within_bounds(solution: Solution, scale_sd_ratio: float = 0.0) -> bool:
     """Tell whether no amplitude is outside what its effect can be, by more than twice its standard deviation.
 
-    scale_sd_ratio: what amplitudes and bounds are uncertain by beside that, as a share: amplitudes are told of believed
-    masses and force constants. All of a reaction, 1.0 of a micro's force that is 0.5 % larger than believed, was refused
-    at the exponent that a friction beside it has.
+    scale_sd_ratio: what amplitudes are uncertain by beside that, as a share of the bound: they are told of believed
+    masses and force constants. All of a reaction, 1.0 of a micro's force that is 0.5 % larger than believed, was
+    refused at the exponent that a friction beside it has.
     """
     allowed = {
         column: bounds
