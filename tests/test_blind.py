@@ -520,6 +520,18 @@ def test_a_scale_error_of_tens_of_micrometres_is_one_of_either_sensor(touching, 
     assert evidence.distances(signal)["scale_error", "macro_sensor"] < 0.05 * whole
 
 
+def test_the_same_law_at_the_other_sensor_is_asked_at_its_own_shape(touching, monkeypatch):
+    """Between the 20 s and 77 s of the grid a drift over 36 s seemed 3.7 deviations from one of the other sensor."""
+    law = laws.BY_NAME["thermal_drift"]
+    drift = draw.Effect(law, "macro_sensor", {"total_m": 17e-6, "time_constant_s": 36.0})
+    evidence = detection.Evidence(touching, draw.simulate(touching, []), 150.0)
+    signal = evidence.whitened([evidence.law_channels(run, law, "macro_sensor", drift.values) for run in evidence.runs])
+    monkeypatch.setattr(detection.laws, "LIBRARY", [law])
+    whole = math.sqrt(evidence.inner(signal, signal))
+    assert evidence.distances(signal)["thermal_drift", "end_sensor"] > 0.005 * whole
+    assert evidence.distances(signal, [drift])["thermal_drift", "end_sensor"] < 1e-3 * whole
+
+
 def test_a_lag_is_told_from_the_delay_that_is_nearest(monkeypatch):
     """Of 78 us, in contact: a delay of 50 us asks for 56, and 200 us for 63."""
     case = generate.draw(2238, None, 20.0)

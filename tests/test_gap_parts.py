@@ -610,3 +610,33 @@ def test_recordings_that_can_not_be_used_are_refused(spoil, said):
 def _with(rows: np.ndarray, name: str, values) -> np.ndarray:
     rows[name] = values
     return rows
+
+
+@pytest.mark.parametrize(("scale_sd_ratio", "is_allowed"), [(0.0, False), (0.008, True)])
+def test_a_bound_is_as_uncertain_as_the_masses_that_amplitudes_are_told_of(scale_sd_ratio, is_allowed):
+    """All of a reaction, of a force that is 1 % larger than believed, 10 deviations of its own beyond all of it."""
+
+    def draw(run, random):
+        reaction = 10.0 * random.standard_normal(4000)
+        return [random.standard_normal(4000) + 1.01 * reaction, reaction]
+
+    whole = Group(("micro_reaction", "macro_force"), (1,), prior_sds=(1.0,), bounds=((0.0, 1.0),))
+    judge = _table_judge(draw, [whole])
+    judge.scale_sd_ratio = scale_sd_ratio
+    assert [group.key for group in judge.select()] == [whole.key] * is_allowed
+
+
+@pytest.mark.parametrize(("shapes", "is_alias"), [((2,), False), ((2, 3), True)])
+def test_the_same_law_elsewhere_is_an_alias_at_any_of_its_shapes(shapes, is_alias):
+    """At the shape that was searched for it 40 squares are between them, at that of the name none."""
+
+    def draw(run, random):
+        drift, other = random.standard_normal(4000), random.standard_normal(4000)
+        return [random.standard_normal(4000) + 0.5 * drift, drift, drift + 0.1 * other, -drift]
+
+    place = "macro_sensor"
+    named, elsewhere = (Group(("thermal_drift", at), (k,)) for k, at in ((1, place), (2, "end_sensor")))
+    judge = _table_judge(draw, [named, elsewhere])
+    forms = [dataclasses.replace(elsewhere, columns=(column,)) for column in shapes]
+    judge.brought_near = lambda other, group: forms if other.key == elsewhere.key else [other]
+    assert [key for key, _ in judge.aliases([named], named)] == [elsewhere.key] * is_alias
