@@ -12,6 +12,7 @@ from stagectl.effects import CATALOGUE
 from stagectl.errors import RecordError, RequestError
 from stagectl.gap import balance, hypotheses, innovations
 from stagectl.gap.believed import Believed, BelievedAxis
+from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.competition import Competition
 from stagectl.gap.evidence import Added
 from stagectl.gap.findings_file import read_findings, write_findings
@@ -51,7 +52,9 @@ def _white(position_m, force_n, sensor_m, slow_n=0.05):
     gain, variance = innovations.gains(
         np.ones(n, bool), np.zeros(n, bool), MASS, H, sensor_m, slow_n, corner, 0.0, 1e3
     )  # fmt: skip
-    return innovations.innovations(position_m, force_n, force_n, gain, variance, MASS, H, corner, 0.0)
+    steps = innovations.filter_steps(gain, variance, MASS, H, corner)
+    whole_n = np.repeat(force_n[:, None], PARTS_COUNT, axis=1)
+    return innovations.innovations(position_m, whole_n, 1.0, steps, np.ones(n, bool), MASS, H, corner, 0.0)
 
 
 def test_a_right_model_leaves_white_noise_of_unit_variance():

@@ -80,32 +80,30 @@ def set_noise(recording: Recording, noise: dict[str, Noise], mask_slow: bool = T
             log.valid, loose, recording.mass_kg(axis), log.period_s, level.sensor_m, level.force_n,
             level.corner_rad_per_s, level.white_force_n, _LOOSE_N,
         )  # fmt: skip
-        recording.filters[axis] = (level, gain, variance)
+        recording.filters[axis] = (
+            level,
+            innovations.filter_steps(gain, variance, recording.mass_kg(axis), log.period_s, level.corner_rad_per_s),
+        )
         judged = log.valid & ~np.concatenate([[False], loose[:-1]])
         judged[: round(_SETTLE_S / log.period_s)] = False
         judged[max(log.samples_count - round(_ENDING_S / log.period_s), 0) :] = False
         recording.judged[axis] = judged
 
 
-def whitened(recording: Recording, axis: str, force_n: np.ndarray | None, position_m: np.ndarray | None) -> np.ndarray:
-    """Return innovations of one body under forces and from positions, at judged samples, shape (m,)."""
-    return _whitened(recording, axis, None if force_n is None else innovations.moments(force_n), position_m)
+_NO_FORCE_N, _NO_POSITION_M = np.empty((0, 0)), np.empty(0)
 
 
-def _whitened(
-    recording: Recording, axis: str, force_n: tuple[np.ndarray, np.ndarray] | None, position_m: np.ndarray | None
+def whitened(
+    recording: Recording, axis: str, force_n: np.ndarray | None, position_m: np.ndarray | None, sign: float = 1.0
 ) -> np.ndarray:
-    """Return the same under the moments of forces."""
-    log = recording.log
-    level, gain, variance = recording.filters[axis]
-    n = log.samples_count
-    mean_n, early_n = (np.zeros(n),) * 2 if force_n is None else force_n
-    x = np.zeros(n) if position_m is None else position_m
-    start_m = float(x[0]) if position_m is not None else 0.0
-    out = innovations.innovations(
-        x, mean_n, early_n, gain, variance, recording.mass_kg(axis), log.period_s, level.corner_rad_per_s, start_m
-    )
-    return out[recording.judged[axis]]
+    """Return innovations of one body under `sign` times forces and from positions, at judged samples, shape (m,)."""
+    level, steps = recording.filters[axis]
+    return innovations.innovations(
+        _NO_POSITION_M if position_m is None else np.ascontiguousarray(position_m),
+        _NO_FORCE_N if force_n is None else np.ascontiguousarray(force_n), sign, steps,
+        recording.judged[axis], recording.mass_kg(axis), recording.log.period_s, level.corner_rad_per_s,
+        0.0 if position_m is None else float(position_m[0]),
+    )  # fmt: skip
 
 
 def channels(recording: Recording) -> list[tuple[str, int]]:
@@ -141,12 +139,9 @@ def column(recording: Recording, forces: Forces) -> list[np.ndarray | None]:
         ("end", forces.end_n, forces.end_sensor_m),
     ):
         if axis in recording.axes:
-            pulled_n = None
-            if force_n is not None:
-                mean_n, early_n = innovations.moments(force_n)
-                pulled_n = -mean_n, -early_n
-            moved = any(values is not None and bool(np.any(values)) for values in (*(pulled_n or ()), sensor_m))
-            parts.append(_whitened(recording, axis, pulled_n, sensor_m) if moved else None)
+            known = force_n is None and sensor_m is None
+            part = None if known else whitened(recording, axis, force_n, sensor_m, sign=-1.0)
+            parts.append(part if part is not None and part.any() else None)
     for axis in recording.reported_a:
         current_a = forces.macro_current_a if axis == "macro" else forces.end_current_a
         parts.append(None if current_a is None else _scaled(recording, axis, current_a))

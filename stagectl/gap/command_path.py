@@ -6,6 +6,7 @@ delay alone). So a linear effect is its step response, put at every step of the 
 memory changes the commands themselves. Pure.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -37,15 +38,31 @@ def delayed(command: np.ndarray, latch_ratio: float, parts: int = PARTS_COUNT) -
     now, before, rest = _held(command, latch_ratio)
     edges = np.arange(parts + 1) / parts
     late = np.clip((rest - edges[:-1]) * parts, 0.0, 1.0)  # share of a part in which the earlier still acts
-    return before[:, None] * late[None, :] + now[:, None] * (1.0 - late)[None, :]
+    return _mixed(before, now, late)
+
+
+@compiled
+def _mixed(before: np.ndarray, now: np.ndarray, late: np.ndarray) -> np.ndarray:
+    mixed = np.empty((now.size, late.size))
+    for k in range(now.size):
+        for part in range(late.size):
+            mixed[k, part] = before[k] * late[part] + now[k] * (1.0 - late[part])
+    return mixed
 
 
 def _held(command: np.ndarray, latch_ratio: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Return, by interval, the command that takes over, the one before, and when, as a share of the interval."""
     whole = int(np.floor(latch_ratio))
-    index = np.arange(command.size) - whole
-    last = command.size - 1
-    return command[np.clip(index, 0, last)], command[np.clip(index - 1, 0, last)], latch_ratio - whole
+    return _later(command, whole), _later(command, whole + 1), latch_ratio - whole
+
+
+@compiled
+def _later(command: np.ndarray, count: int) -> np.ndarray:
+    """Return commands so many intervals later; beyond both ends stands the nearest one."""
+    later = np.empty(command.size)
+    for k in range(command.size):
+        later[k] = command[min(max(k - count, 0), command.size - 1)]
+    return later
 
 
 def driven(command: np.ndarray, latch_s: float, lag_s: float, period_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -238,18 +255,31 @@ def _run(effect: Effect, parameters: list[float], command: np.ndarray, lag_s: fl
     times_s = (np.arange(command.size) * dt_s).reshape(command.shape)
     known = {"command_a": command, "t_s": times_s, "dt_s": np.full(command.shape, dt_s)}
     known["current_loop_s"] = np.full(command.shape, lag_s)
-    columns = np.column_stack([known[name].ravel() for name in effect.quantities])
+    columns = np.stack([known[name].ravel() for name in effect.quantities]).T
     out = compose.along_one_machine(effect)(columns, np.array([*parameters, 0.0]), np.zeros(max(effect.memory, 1)))
     return np.asarray(out).reshape(command.shape)
 
 
 def _step_response(effect: Effect, parameters: list[float], lag_s: float, period_s: float, height: float) -> np.ndarray:
-    """Return what an effect adds to a step of its command, means over steps of a fine grid."""
+    """Return what an effect adds to a step of its command, means over steps of a fine grid; not to be written to."""
+    return _response(effect.name, effect.origin, tuple(parameters), lag_s, period_s, height)
+
+
+@functools.lru_cache(maxsize=64)
+def _response(
+    name: str,
+    _origin: str,  # a user's law may have another text the next time
+    parameters: tuple[float, ...],
+    lag_s: float,
+    period_s: float,
+    height: float,
+) -> np.ndarray:
+    """Make it: all recordings of one machine ask for the same."""
     out = np.zeros(1)
     for periods in _RESPONSE_PERIODS:
         command = np.full((round(periods / _STEP_RATIO) + 1, 1), height)
         command[0] = 0.0  # an effect may take the first command that it sees for one that was always there
-        out = _run(effect, parameters, command, lag_s, _STEP_RATIO * period_s)[1:, 0]
+        out = _run(CATALOGUE[name], list(parameters), command, lag_s, _STEP_RATIO * period_s)[1:, 0]
         there = np.flatnonzero(np.abs(out) > _FADED * np.max(np.abs(out)))
         if not there.size:
             return out[:1]

@@ -23,6 +23,7 @@ from stagectl.gap.refinement import (
     gain_at_size,
     nearest_place,
     refined,
+    searched_count,
     with_shape,
 )
 from stagectl.gap.selection import Judge
@@ -120,9 +121,10 @@ class Competition:
 
     def _refined(self, beside: Sequence[Group], groups: Sequence[Group]) -> list[Group]:
         """Return groups at their best shapes, as new columns; a group itself where nothing is to be searched."""
-        outcomes = self._crew.map(
-            refined, (self.evidence, self._beside(beside)), [self.term(group) for group in groups]
-        )
+        asked = [self.term(group) for group in groups]
+        longest_first = sorted(range(len(asked)), key=lambda k: -searched_count(asked[k]))
+        found = self._crew.map(refined, (self.evidence, self._beside(beside)), [asked[k] for k in longest_first])
+        outcomes = [one for _, one in sorted(zip(longest_first, found, strict=True), key=lambda pair: pair[0])]
         terms = [outcome[0] for outcome in outcomes if outcome is not None]
         columns = iter(self._crew.here(self.evidence.columns_of, terms))
         added = [

@@ -154,7 +154,9 @@ def _commanded(recording: Recording, axis: str, effect: Effect, parameters: list
     if axis not in recording.axes:
         return Forces()
     drive = recording.belief(axis)
-    now, then = (driven_by(recording, axis, acting, drive) for acting in ([], [(effect, parameters)]))
+    if axis not in recording.driven_n:
+        recording.driven_n[axis] = driven_by(recording, axis, [], drive)
+    now, then = recording.driven_n[axis], driven_by(recording, axis, [(effect, parameters)], drive)
     motor_n, at_n = (after - before for before, after in zip(now, then, strict=True))
     return motor_forces(recording, axis, motor_n, at_n / drive.force_constant_n_per_a)
 

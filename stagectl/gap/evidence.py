@@ -95,7 +95,8 @@ class Evidence:
         """Leave behind what another process makes for itself: columns, their sums, quantities along the motion."""
         return {
             "recordings": [
-                replace(recording, known={}, exchanged={}, others_n={}, pushed_n={}) for recording in self.recordings
+                replace(recording, known={}, exchanged={}, others_n={}, pushed_n={}, driven_n={})
+                for recording in self.recordings
             ],
             "channels": [
                 [replace(one, numbers=[INNOVATIONS], rows=one.rows[:1]) for one in channels]

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stagectl.compiled import compiled
+from stagectl.compiled import compiled, inlined
+from stagectl.gap.command_path import PARTS_COUNT
 
 _START_SD = (1e-6, 1e-2)  # of position and velocity before the first sample, m and m/s
 _STATES = 4
@@ -101,27 +102,57 @@ def gains(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, 
 
 
 @compiled
-def innovations(position_m, mean_n, early_n, gain, variance, mass_kg, period_s, corner_rad_per_s, start_m):
-    """Return the whitened innovations of positions under forces (mean and early-weighted mean an interval), (n,)."""
-    n = position_m.size
-    out = np.zeros(n)
+def filter_steps(gain, variance, mass_kg, period_s, corner_rad_per_s):
+    """Return what `innovations` needs of a filter at each sample, (n, 5): what an innovation adds by the next one, sd.
+
+    What is added to position, velocity and both of the slow force holds the step, and is all that one sample waits for
+    of the sample before: twelve cycles, not forty. Only the filter decides about it, and it runs a thousand times.
+    """
+    h = period_s
+    moved, turned = 0.5 * h * h / mass_kg, h / mass_kg
+    dd, de, ed, ee = _slow(corner_rad_per_s * h)
+    out = np.zeros((gain.shape[0], 5))
+    for k in range(gain.shape[0]):
+        g0, g1, g2, g3 = gain[k, 0], gain[k, 1], gain[k, 2], gain[k, 3]
+        out[k, 0], out[k, 1] = g0 + g1 * h + moved * g2, g1 + turned * g2
+        out[k, 2], out[k, 3] = dd * g2 + de * g3, ed * g2 + ee * g3
+        out[k, 4] = np.sqrt(variance[k]) if g0 != 0.0 else np.inf  # no sample, no innovation
+    return out
+
+
+@compiled
+def innovations(position_m, force_n, sign, steps, judged, mass_kg, period_s, corner_rad_per_s, start_m):
+    """Return the whitened innovations at judged samples, (m,), of positions under `sign` times forces.
+
+    position_m: (n,), force_n: (n, PARTS_COUNT); either one may be empty, and is zero then.
+    """
+    out = np.zeros(judged.size)
+    has_position, has_force = not _is_nothing(position_m), not _is_nothing(force_n)
+    if not has_position and not has_force:
+        return out[judged]
+    if has_force and force_n.shape != (judged.size, PARTS_COUNT):
+        raise ValueError("forces are not on the parts of these intervals")
     h = period_s
     moved, turned = 0.5 * h * h / mass_kg, h / mass_kg
     x = start_m
     v = 0.0
     d = 0.0
     e = 0.0
+    mean_n = 0.0
+    early_n = 0.0
     dd, de, ed, ee = _slow(corner_rad_per_s * h)
-    for k in range(n):
-        g0, g1, g2, g3 = gain[k, 0], gain[k, 1], gain[k, 2], gain[k, 3]
-        z = position_m[k] - x
-        if g0 != 0.0:
-            out[k] = z / np.sqrt(variance[k])
-        # what z adds is added last, by a gain that holds the step: sample waits for sample twelve cycles, not forty
-        x = (x + v * h + moved * (early_n[k] + d)) + (g0 + g1 * h + moved * g2) * z
-        v = (v + turned * (mean_n[k] + d)) + (g1 + turned * g2) * z
-        d, e = (dd * d + de * e) + (dd * g2 + de * g3) * z, (ed * d + ee * e) + (ed * g2 + ee * g3) * z
-    return out
+    judged_count = 0
+    for k in range(judged.size):
+        z = (position_m[k] if has_position else 0.0) - x
+        out[judged_count] = z / steps[k, 4]
+        judged_count += judged[k]
+        if has_force:
+            mean_n, early_n = _moments(force_n, k)
+            mean_n, early_n = sign * mean_n, sign * early_n
+        x = (x + v * h + moved * (early_n + d)) + steps[k, 0] * z
+        v = (v + turned * (mean_n + d)) + steps[k, 1] * z
+        d, e = (dd * d + de * e) + steps[k, 2] * z, (ed * d + ee * e) + steps[k, 3] * z
+    return out[:judged_count].copy()
 
 
 @compiled
@@ -172,16 +203,28 @@ def filtered(position_m, valid, mean_n, early_n, gain, variance, mass_kg, period
     return known, foretold, unlikely
 
 
+@inlined
+def _is_nothing(values):
+    """Tell whether all values are zero; of others the first ones tell."""
+    for value in values.flat:  # noqa: SIM110
+        if value != 0.0:
+            return False
+    return True
+
+
+@inlined
+def _moments(fine_n, k):
+    mean, early = 0.0, 0.0
+    for part in range(PARTS_COUNT):
+        mean += fine_n[k, part]
+        early += (2.0 - (2.0 * part + 1.0) / PARTS_COUNT) * fine_n[k, part]
+    return mean / PARTS_COUNT, early / PARTS_COUNT
+
+
 @compiled
 def moments(fine_n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (mean, early-weighted mean) of forces on equal parts of each interval, shape (n, parts)."""
-    n, parts = fine_n.shape
-    mean_n, early_n = np.empty(n), np.empty(n)
-    weights = 2.0 * (1.0 - (np.arange(parts) + 0.5) / parts)
-    for k in range(n):
-        mean, early = 0.0, 0.0
-        for part in range(parts):
-            mean += fine_n[k, part]
-            early += weights[part] * fine_n[k, part]
-        mean_n[k], early_n[k] = mean / parts, early / parts
+    """Return (mean, early-weighted mean) of forces on parts of each interval, shape (n, PARTS_COUNT)."""
+    mean_n, early_n = np.empty(fine_n.shape[0]), np.empty(fine_n.shape[0])
+    for k in range(fine_n.shape[0]):
+        mean_n[k], early_n[k] = _moments(fine_n, k)
     return mean_n, early_n

@@ -38,7 +38,7 @@ class Recording:
     penetration_m: np.ndarray | None
     penetration_velocity_m_per_s: np.ndarray | None
     side: np.ndarray | None
-    filters: dict[str, tuple[Noise, np.ndarray, np.ndarray]]
+    filters: dict[str, tuple[Noise, np.ndarray]]  # what whitens a body, by axis, and its steps
     judged: dict[str, np.ndarray]
     known: dict[tuple[str, str], dict[str, np.ndarray]]  # quantities by axis and kind of place, once asked for
     reported_a: dict[str, np.ndarray]  # reported minus believed current at the samples, by axis, where it is known
@@ -52,6 +52,7 @@ class Recording:
     exchanged: dict[str, Forces] = field(default_factory=dict)  # without what is late of one sensor, once asked for
     others_n: dict[str, np.ndarray] = field(default_factory=dict)  # on a body, without what swings, once asked for
     pushed_n: dict[float, np.ndarray] = field(default_factory=dict)  # by the contact, by damping, once asked for
+    driven_n: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # by motors alone, once asked for
     apart: tuple[np.ndarray, np.ndarray] | None = None  # macro minus end at one instant, and its rate
 
     @property
@@ -131,7 +132,9 @@ def put_together(
 
 def with_late(recording: Recording, late: tuple[Row, ...]) -> Recording:
     """Return it with other effects that make readings late; motions and what the motors do stay."""
-    there = replace(recording, late=late, known={}, exchanged={}, felt_n={}, now={}, others_n={}, pushed_n={})
+    there = replace(
+        recording, late=late, known={}, exchanged={}, felt_n={}, now={}, others_n={}, pushed_n={}, driven_n={}
+    )
     _read(there)
     return there
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stagectl.gap import innovations
+from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.recording import Recording
 
 PEAKS_COUNT = 4
@@ -25,15 +26,14 @@ _SMOOTHED_COUNT = 5
 
 def force_signal(recording: Recording, axis: str, rest: np.ndarray) -> np.ndarray:
     """Return the adjoint of the whitening on `rest` (innovations at judged samples), one element a sample."""
-    level, gain, variance = recording.filters[axis]
+    level, steps = recording.filters[axis]
     whole = np.zeros(recording.log.samples_count)
     whole[recording.judged[axis]] = rest
-    backwards = np.ascontiguousarray(whole[::-1])
-    n = backwards.size
-    settled = np.repeat(gain[n // 2 : n // 2 + 1], n, axis=0)
+    n = whole.size
+    settled = np.repeat(steps[n // 2 : n // 2 + 1], n, axis=0)
     out = innovations.innovations(
-        np.zeros(n), backwards, backwards, settled, np.full(n, variance[n // 2]), recording.mass_kg(axis),
-        recording.log.period_s, level.corner_rad_per_s, 0.0,
+        np.empty(0), np.repeat(whole[::-1, None], PARTS_COUNT, axis=1), 1.0, settled, np.ones(n, bool),
+        recording.mass_kg(axis), recording.log.period_s, level.corner_rad_per_s, 0.0,
     )  # fmt: skip
     return -out[::-1]
 
