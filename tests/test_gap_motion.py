@@ -9,7 +9,7 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.competition import Competition
-from stagectl.gap.contact import contact_at
+from stagectl.gap.contact import contact_at, more_push_n
 from stagectl.gap.effect_forces import effect_forces, known_forces
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.findings import Named
@@ -177,6 +177,19 @@ def test_an_edge_is_passed_at_its_own_instant(rate_m_per_s):
         exact_n = np.maximum(JOINT.right_stiffness_n_per_m * depth_m + 90.0 * rate_m_per_s, 0.0) * (depth_m > 0.0)
         assert np.min(push_n) >= 0.0
         assert part_s * np.sum(push_n) == pytest.approx(np.trapezoid(exact_n, fine_s), rel=1e-4)
+
+
+@pytest.mark.parametrize("damping_n_s_per_m", [0.0, 90.0])
+def test_what_is_pushed_more_is_what_the_moved_contact_pushes_less_what_it_did(damping_n_s_per_m):
+    random = np.random.default_rng(5)
+    x_b, rate = 150e-6 * random.standard_normal((200, 4)), 0.02 * random.standard_normal((200, 4))
+    apart_m, apart_m_per_s = 20e-6 * random.standard_normal((200, 4)), 0.01 * random.standard_normal((200, 4))
+    out_m = 10e-6 * random.random((200, 4)), 3e-6
+    before_n = contact_at(JOINT, damping_n_s_per_m, x_b, rate, H / 4).push_n(JOINT, damping_n_s_per_m)
+    moved = contact_at(JOINT, damping_n_s_per_m, x_b + apart_m, rate + apart_m_per_s, H / 4, *out_m)
+    more_n = more_push_n(JOINT, damping_n_s_per_m, x_b, rate, H / 4, apart_m, apart_m_per_s, *out_m, before_n)
+    assert np.ptp(moved.side) == 2.0
+    assert more_n == pytest.approx(moved.push_n(JOINT, damping_n_s_per_m) - before_n, abs=1e-12)
 
 
 @pytest.mark.parametrize("beside", [True, False])

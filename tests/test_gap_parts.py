@@ -68,6 +68,31 @@ def test_a_right_model_leaves_white_noise_of_unit_variance():
     assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.03
 
 
+def test_forces_that_are_not_on_parts_of_these_intervals_are_refused():
+    steps = innovations.filter_steps(np.ones((10, 4)), np.ones(10), MASS, H, 12.0)
+    for shape in ((10, 1), (9, PARTS_COUNT)):
+        with pytest.raises(ValueError, match="parts of these intervals"):
+            innovations.innovations(np.empty(0), np.ones(shape), 1.0, steps, np.ones(10, bool), MASS, H, 12.0, 0.0)
+
+
+def test_what_is_zero_everywhere_is_no_column_and_what_is_nan_is_one():
+    recording = balance.recording_of(_axis_log("run 1", 1.0, 1), _believed())
+    balance.set_noise(recording, noise_of([recording]))
+    shape = (recording.log.samples_count, PARTS_COUNT)
+    nothing, late = np.zeros(shape), np.zeros(shape)
+    late[-1, -1] = np.nan
+    assert balance.column(recording, Forces(macro_n=nothing, macro_sensor_m=nothing[:, 0]))[0] is None
+    assert balance.column(recording, Forces(macro_n=late))[0] is not None
+
+
+def test_a_search_knows_how_surely_masses_and_force_constants_are_known():
+    believed = _believed()
+    macro = dataclasses.replace(believed.macro, mass_sd_kg=0.03 * believed.macro.mass_kg, force_constant_sd_ratio=0.04)
+    recordings = [balance.recording_of(_axis_log("run 1", 1.0, 1), dataclasses.replace(believed, macro=macro))]
+    search = Competition(recordings, 1, noise=noise_of(recordings))
+    assert search.judge.scale_sd_ratio == pytest.approx(0.05)
+
+
 def test_what_is_missing_adds_its_own_column():
     n = 3000
     force = 20.0 * np.sin(2.0 * np.pi * 1.3 * np.arange(n) * H)

@@ -139,9 +139,8 @@ def column(recording: Recording, forces: Forces) -> list[np.ndarray | None]:
         ("end", forces.end_n, forces.end_sensor_m),
     ):
         if axis in recording.axes:
-            known = force_n is None and sensor_m is None
-            part = None if known else whitened(recording, axis, force_n, sensor_m, sign=-1.0)
-            parts.append(part if part is not None and part.any() else None)
+            is_nothing = all(values is None or innovations.is_nothing(values) for values in (force_n, sensor_m))
+            parts.append(None if is_nothing else whitened(recording, axis, force_n, sensor_m, sign=-1.0))
     for axis in recording.reported_a:
         current_a = forces.macro_current_a if axis == "macro" else forces.end_current_a
         parts.append(None if current_a is None else _scaled(recording, axis, current_a))

@@ -167,8 +167,7 @@ class Competition:
         near = nearest_place(self.evidence.recordings, term)
         found = [other] if near is term else self._appended([near], other)
         if term.name == named.name and term.linear == named.linear:
-            size = CATALOGUE[term.name].parameters[0] if term.name in CATALOGUE else ""
-            shape = named.shape
+            size, shape = CATALOGUE[term.name].parameters[0], named.shape
             if size in shape:  # what one reads too much the other reads too little
                 shape = shape | {size: float(np.copysign(shape[size], term.shape[size]))}
             found += self._appended([with_shape(term, shape)], other) if shape != term.shape else []
@@ -236,7 +235,12 @@ def _periodic_terms(evidence: Evidence, known_sds: np.ndarray, all_sds: np.ndarr
     found: list[Term] = []
     for place, axis in enumerate(recordings[0].axes):
         left, unknown = (
-            [seeds.force_signal(r, axis, evidence.rest(k, place, sds)) for k, r in enumerate(recordings)]
+            evidence.crew.here(
+                lambda k, place=place, axis=axis, sds=sds: seeds.force_signal(
+                    recordings[k], axis, evidence.rest(k, place, sds)
+                ),
+                range(len(recordings)),
+            )
             for sds in (all_sds, known_sds)
         )
         noise = seeds.of_noise(recordings, axis, random)

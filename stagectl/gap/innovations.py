@@ -126,10 +126,8 @@ def innovations(position_m, force_n, sign, steps, judged, mass_kg, period_s, cor
 
     position_m: (n,), force_n: (n, PARTS_COUNT); either one may be empty, and is zero then.
     """
-    out = np.zeros(judged.size)
-    has_position, has_force = not _is_nothing(position_m), not _is_nothing(force_n)
-    if not has_position and not has_force:
-        return out[judged]
+    out = np.empty(judged.size)
+    has_position, has_force = position_m.size > 0, force_n.size > 0
     if has_force and force_n.shape != (judged.size, PARTS_COUNT):
         raise ValueError("forces are not on the parts of these intervals")
     h = period_s
@@ -153,6 +151,15 @@ def innovations(position_m, force_n, sign, steps, judged, mass_kg, period_s, cor
         v = (v + turned * (mean_n + d)) + steps[k, 1] * z
         d, e = (dd * d + de * e) + steps[k, 2] * z, (ed * d + ee * e) + steps[k, 3] * z
     return out[:judged_count].copy()
+
+
+@compiled
+def is_nothing(values: np.ndarray) -> bool:
+    """Tell whether all values are zero; of others the first ones tell."""
+    for value in values.flat:  # noqa: SIM110
+        if value != 0.0:
+            return False
+    return True
 
 
 @compiled
@@ -201,15 +208,6 @@ def filtered(position_m, valid, mean_n, early_n, gain, variance, mass_kg, period
         v += a[1, 2] * d + h * mean_n[k] / mass_kg
         d, e = a[2, 2] * d + a[2, 3] * e, a[3, 2] * d + a[3, 3] * e
     return known, foretold, unlikely
-
-
-@inlined
-def _is_nothing(values):
-    """Tell whether all values are zero; of others the first ones tell."""
-    for value in values.flat:  # noqa: SIM110
-        if value != 0.0:
-            return False
-    return True
 
 
 @inlined

@@ -188,9 +188,7 @@ def _band_pass(period_s: float) -> np.ndarray:
 
 def _balance(recording: Recording, axis: str) -> _Balance:
     h, motion = recording.log.period_s, recording.motion(axis)
-    raw_n = residual.missing_force_n(recording, axis, Forces())
-    left_n = residual.missing_force_n(recording, axis, known_forces(recording))
-    inertia_n, force_n = in_band(raw_n, h), in_band(raw_n - left_n, h)
+    inertia_n, force_n = _both_sides_n(recording, axis)
     velocity = motion.velocity_m_per_s.mean(axis=1)
     beside = [velocity, np.sign(velocity), motion.position_m.mean(axis=1)]
     columns = np.column_stack([force_n, *(in_band(values, h) for values in beside)])
@@ -218,8 +216,20 @@ def _balance(recording: Recording, axis: str) -> _Balance:
         factor_sd=float(np.sqrt(covariance[0, 0]) / scale[0]),
         explained_ratio=1.0 - float(np.mean(rest**2)) / max(whole, 1e-300),
         weight=1.0 / max(float(normal[0, 0]) / scale[0] ** 2, 1e-300),
-        left_ratio=float(np.mean((inertia_n - force_n) ** 2)) / max(whole, 1e-300),
+        left_ratio=_left_ratio(inertia_n, force_n),
     )
+
+
+def _both_sides_n(recording: Recording, axis: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return what moves a body as it did, and what is believed to act on it, in the band that is compared."""
+    h = recording.log.period_s
+    raw_n = residual.missing_force_n(recording, axis, Forces())
+    left_n = residual.missing_force_n(recording, axis, known_forces(recording))
+    return in_band(raw_n, h), in_band(raw_n - left_n, h)
+
+
+def _left_ratio(inertia_n: np.ndarray, force_n: np.ndarray) -> float:
+    return float(np.mean((inertia_n - force_n) ** 2)) / max(float(np.mean(inertia_n**2)), 1e-300)
 
 
 def _pushed_rest_n(recording: Recording, axis: str, columns: np.ndarray, inertia_n: np.ndarray) -> np.ndarray | None:
@@ -267,7 +277,7 @@ def _check_swapped(believed: Believed, recordings: Sequence[Recording], balances
         left = sum(b.left_ratio for b in own)
         for text, log in _variants(recording.log):
             other = balance.recording_of(log, believed)
-            if sum(_balance(other, axis).left_ratio for axis in other.axes) < _SWAP_RATIO * left:
+            if sum(_left_ratio(*_both_sides_n(other, axis)) for axis in other.axes) < _SWAP_RATIO * left:
                 raise RequestError(f"{log.name}: forces and motion agree far better with {text}; map the columns again")
 
 

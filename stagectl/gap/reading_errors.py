@@ -25,13 +25,13 @@ def reading_error_m(
     if Trait.FIRST_ORDER in effect.traits:
         return _mean_error_m(effect, known, parameters)
     error_m = along_motion(effect, [known[name] for name in effect.quantities], parameters)
-    if not whole:
+    asked = {"position_m", "velocity_m_per_s"}.intersection(effect.quantities)
+    if not whole or not asked:
         return error_m
     for _ in range(_READING_PASSES):
-        true = known | {
-            "position_m": known["position_m"] - error_m,
-            "velocity_m_per_s": known["velocity_m_per_s"] - np.gradient(error_m, recording.log.period_s, axis=0),
-        }
+        true = known | {"position_m": known["position_m"] - error_m}
+        if "velocity_m_per_s" in asked:
+            true["velocity_m_per_s"] = known["velocity_m_per_s"] - np.gradient(error_m, recording.log.period_s, axis=0)
         error_m = along_motion(effect, [true[name] for name in effect.quantities], parameters)
     return error_m
 
