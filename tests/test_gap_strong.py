@@ -3,18 +3,20 @@
 import functools
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stagectl.effects import CATALOGUE
-from stagectl.gap import balance, hypotheses, seeds
+from stagectl.gap import balance, hypotheses, looks, seeds
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Serial
 from stagectl.gap.curvature import at_best_shapes
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.known_motion import moved_under
 from stagectl.gap.log import Log
+from stagectl.gap.looks import Look
 from stagectl.gap.naming import all_named, measured
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group, solve
@@ -356,6 +358,26 @@ def test_known_parameters_make_up_for_nothing_that_is_part_of_the_operating_poin
     assert moved[2]["delay_s"] == pytest.approx(delay_s, abs=10e-6)
     added_n = [forces.macro_n for forces in map(motion.explained, motion.recordings)]
     assert all(float(np.sqrt(np.mean(n**2))) < 0.01 for n in added_n if n is not None)  # 0.3 and 0.4 N
+
+
+ROUGH_N = 0.512  # a force noise that what nobody explains yet can look like
+
+
+def test_what_an_operating_point_explains_is_told_in_units_of_the_noise_there():
+    """In units of the look before a clock of 495 million squares was 1.5 million, and a mode of 150 stood beside it."""
+    delay_s = 0.6e-3
+    recordings = [balance.recording_of(axis_under(_late(delay_s), seed), AXIS) for seed in (1, 2)]
+    term = hypotheses.term_at_size(CATALOGUE["command_delay"], "macro_command", {"delay_s": delay_s})
+    rough = {"macro": replace(slow_noise(AXIS, recordings[0])["macro"], white_force_n=ROUGH_N)}
+    first = Competition(recordings, 2, noise=rough, kept=[term])
+    search = looks._under(Look(first, first.kept, ()), (), first, recordings, frozenset(), frozenset(), Serial())
+    told = []
+    for noise in (first.noise, search.noise):
+        for recording in recordings:
+            balance.set_noise(recording, noise)
+        told.append(sum(float(np.sum(z**2)) - z.size for r in recordings for z in balance.observed(r)))
+    assert told[0] < 100.0
+    assert 0.5 * told[1] < search.judge.at_size < told[1]  # known parameters explain some of it
 
 
 def test_a_size_that_is_no_factor_follows_the_power_of_its_law():
