@@ -30,7 +30,7 @@ from pyarrow import csv
 from bench.blind_names import in_words_of_the_truth
 from bench.seeds import seeds_of
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
-from stagectl.gap.heap import keep_freed
+from stagectl.gap.heap import give_back, keep_freed
 from stagectl.gap.log import Log
 from stagectl.gap.workflow import find
 from tests.blind import generate, score
@@ -249,6 +249,7 @@ def search(job: Job) -> Searched:
     truth = None
     begin_s = time.monotonic()
     keep_freed()
+    give_back()  # what the set before held
     try:
         folder, truth = generated(job)
         blind = load_set(folder)

@@ -27,7 +27,7 @@ from bench.blind_sets import (
 from bench.figure import Bar, Figure, absent, judged
 from stagectl.gap.believed import Believed
 from stagectl.gap.crew import crew_of
-from stagectl.gap.heap import keep_freed
+from stagectl.gap.heap import give_back, keep_freed
 from stagectl.gap.log import Log
 from stagectl.gap.workflow import find
 
@@ -60,6 +60,7 @@ def figures(*, full: bool, say: Say) -> Iterator[Figure]:
     say("speed, alone")
     yield from speed(full, say)
     yield from emps_figures.figures(say)
+    give_back()  # the sets are searched by other processes
     if full:
         yield from _full(say)
     else:

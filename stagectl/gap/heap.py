@@ -1,6 +1,7 @@
 """The memory that arrays of a search live in: what is freed stays with the process for the next one."""
 
 import ctypes
+import gc
 import sys
 
 _M_TRIM_THRESHOLD = -1  # mallopt(3)
@@ -21,3 +22,16 @@ def keep_freed() -> None:
         if mallopt is not None:
             mallopt(_M_MMAP_THRESHOLD, _LARGEST_OF_HEAP_BYTES)
             mallopt(_M_TRIM_THRESHOLD, _NEVER_BYTES)
+
+
+def give_back() -> None:
+    """Give the kernel back what has been freed until now: others are to work beside this process from here on.
+
+    Searches that are over hold each other in circles, which the interpreter looks for by the count of objects and not
+    by their size: after twenty of them a process held 11 GB; one of 2.4 GB kept 1.9 without a look for them, 0.4 with.
+    """
+    gc.collect()
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)
