@@ -171,17 +171,10 @@ def without(name: str, acts_on: str) -> frozenset[str]:
 
 
 def left_out(found: list[Marked], full: bool, say: Say, most: int | None, until_s: float) -> Figure:
-    """Search the first single of every effect again, with a library that lacks it."""
-    first: dict[str, tuple[int, str | None, str, str]] = {}
-    for one in found:
-        truth = one.searched.truth
-        if truth is not None and one.mark["category"] == "single":
-            (member,) = truth["effects"]
-            first.setdefault(member["name"], (one.searched.seed, None, member["name"], member["acts_on"]))
-    chosen = list(first.values())[:most]
+    """Search a single of every effect again, with a library that lacks it: the one that no other law comes near."""
     jobs = [
-        Job(seed, kind, sets_folder(), keep=not full, options=(("without", without(name, acts_on)),))
-        for seed, kind, name, acts_on in chosen
+        Job(seed, None, sets_folder(), keep=not full, options=(("without", without(name, acts_on)),))
+        for name, (_, seed, acts_on) in list(suite_figures.farthest_singles(found).items())[:most]
     ]
     say(f"the library without one effect, {len(jobs)} times")
     again = []

@@ -1,6 +1,7 @@
 """What a long measurement depends on: its sources as code, comments and docstrings left out, and what computes them."""
 
 import ast
+import functools
 import hashlib
 from collections.abc import Iterable, Iterator
 from importlib import metadata
@@ -58,15 +59,23 @@ def _with_imports(begun: Iterable[Path], root: Path, folders: tuple[str, ...]) -
 
 def _imported(path: Path, root: Path, folders: tuple[str, ...]) -> Iterator[Path]:
     """Yield the modules of these folders that a file imports, anywhere in it, and the packages that they are in."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
-        if isinstance(node, ast.ImportFrom) and node.module is not None and not node.level:
-            names = [node.module, *(f"{node.module}.{one.name}" for one in node.names)]
-        for name in names:
-            parts = name.split(".")
-            if parts[0] in folders:
-                files = [root.joinpath(*parts[:count], "__init__.py") for count in range(1, len(parts) + 1)]
-                yield from (one for one in [*files, root.joinpath(*parts).with_suffix(".py")] if one.is_file())
+    for name in _imported_names(path.read_text()):
+        parts = name.split(".")
+        if parts[0] in folders:
+            files = [root.joinpath(*parts[:count], "__init__.py") for count in range(1, len(parts) + 1)]
+            yield from (one for one in [*files, root.joinpath(*parts).with_suffix(".py")] if one.is_file())
+
+
+@functools.cache  # by the text: of three hundred files one is another the next time
+def _imported_names(text: str) -> tuple[str, ...]:
+    """Return what a Python file imports by absolute names; of `from a import b` both a and a.b, whichever is a file."""
+    found: list[str] = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found += [one.name for one in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module is not None and not node.level:
+            found += [node.module, *(f"{node.module}.{one.name}" for one in node.names)]
+    return tuple(found)
 
 
 def _hash_of(paths: Iterable[Path], root: Path, packages: Iterable[str]) -> str:
@@ -80,6 +89,7 @@ def _hash_of(paths: Iterable[Path], root: Path, packages: Iterable[str]) -> str:
     return digest.hexdigest()[:16]
 
 
+@functools.cache
 def _code(text: str) -> bytes:
     """Return the syntax tree of a Python file, without the places in it, comments and docstrings."""
     return ast.dump(_WithoutDocstrings().visit(ast.parse(text))).encode()

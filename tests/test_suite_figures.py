@@ -14,7 +14,16 @@ from bench import final_seeds, gap, suite_figures
 from bench.blind_sets import Searched, marked
 from bench.figure import Bar
 from bench.sources import ROOT, gap_sources
-from bench.suite_figures import coverage_figure, judged_estimate, left_out_right, pooled, quantile, share, suite
+from bench.suite_figures import (
+    coverage_figure,
+    farthest_singles,
+    judged_estimate,
+    left_out_right,
+    pooled,
+    quantile,
+    share,
+    suite,
+)
 
 
 def member(name="coulomb_friction", inseparable=(), level_n=2.0):
@@ -174,6 +183,25 @@ def test_left_out():
     assert not left_out_right(one(1, "single", [found("coulomb_friction")], member("asymmetric_coulomb_friction")))
     assert gap.without("cogging", "macro_force") == {"cogging", "harmonic_cogging"}
     assert gap.without("tilt", "macro_force") == {"gravity_tilt"}
+
+
+def test_an_effect_is_left_out_of_the_set_that_no_other_law_comes_near():
+    def single(seed, name, nearest):
+        return one(seed, "single", [found(name)], member(name) | {"nearest": nearest})
+
+    lag, mass = ["sensor_lag", "macro_sensor"], ["mass_error", "macro_force"]
+    sets = [
+        single(1, "sensor_delay", [[*lag, 9.3], [*mass, 250.0]]),
+        single(2, "sensor_delay", [[*lag, 38.3], [*mass, 40.0]]),
+        single(3, "sensor_delay", [[*lag, 0.8], [*mass, 900.0]]),
+        single(4, "coulomb_friction", [[*mass, 12.0]]),
+        one(5, "multi", [found()], member("offset"), member("tilt")),
+        one(6, "null"),
+    ]
+    assert farthest_singles(sets) == {
+        "sensor_delay": (38.3, 2, "macro_force"),
+        "coulomb_friction": (12.0, 4, "macro_force"),
+    }
 
 
 # ---- the record of the final seeds -----------------------------------------------------------------------------------
