@@ -213,6 +213,7 @@ CONTAINED_IN: dict[str, tuple[frozenset[str], ...]] = {
     "viscous_friction": (frozenset({"asymmetric_viscous_friction"}),),
     "coulomb_friction": (frozenset({"asymmetric_coulomb_friction"}),),
     "dahl_friction": (frozenset({"lugre_friction"}),),
+    "stribeck_friction": (frozenset({"lugre_friction"}),),
     "linear_stiffness": (frozenset({"cable_spring"}), frozenset({"cable_spring", "offset"})),
     "cable_spring": (frozenset({"linear_stiffness"}), frozenset({"linear_stiffness", "offset"})),
 }

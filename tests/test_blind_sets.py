@@ -136,14 +136,14 @@ def test_one_axis_has_no_micro_and_its_damping_is_an_effect(single_axis, tmp_pat
     assert held_out(blind) == () or len(blind.logs) >= 4
 
 
-def test_held_out_is_the_run_that_differs_most_and_never_the_only_one_at_the_stops(macro_micro):
+def test_held_out_is_the_run_that_differs_most_and_never_the_only_one_at_the_stops_or_so_fast(macro_micro):
     blind, _, _ = macro_micro
     log, gains = blind.logs[0], blind.gains[0]
     free, stops = np.zeros(10), np.linspace(-1e-3, 1e-3, 10)
 
-    def made(sessions, payloads, touching):
+    def made(sessions, payloads, touching, fast=()):
         logs = tuple(
-            replace(log, name=f"run_{k}", session=s, end_payload_kg=p)
+            replace(log, name=f"run_{k}", session=s, end_payload_kg=p, reference_m=log.reference_m * (1 + (k in fast)))
             for k, (s, p) in enumerate(zip(sessions, payloads, strict=True))
         )
         paths = tuple(stops if k in touching else free for k in range(len(logs)))
@@ -155,6 +155,9 @@ def test_held_out_is_the_run_that_differs_most_and_never_the_only_one_at_the_sto
     assert held_out(made("0000", (0, 0, 0, 0), (1, 3))) == (3,)
     assert held_out(made("00100", (0, 0, 0, 0, 0), ())) == (2,)
     assert held_out(made("01000", (0, 3, 0, 4, 0), (4,))) == (1,)
+    assert held_out(made("0000", (0, 0, 0, 0), (), (3,))) == (2,)
+    assert held_out(made("0000", (0, 0, 0, 0), (2,), (3,))) == (1,)
+    assert held_out(made("0001", (0, 0, 0, 0), (), (1, 3))) == (3,)
 
 
 # ---- marking ---------------------------------------------------------------------------------------------------------
