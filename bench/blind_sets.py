@@ -166,8 +166,8 @@ def held_out(blind: BlindSet) -> tuple[int, ...]:
     """Choose the run that a user would keep apart: none of three, one of four or five.
 
     It is the one that differs in most of homing, payload and gains from all others, the last of equals; never the only
-    one that touches the stops, and none that is faster than all others, since nothing could be learnt of that. A drag,
-    to which the others were too slow, left eleven times of what there was where the fast run was kept apart (1001115).
+    one that touches the stops, and none that is faster than all others, since nothing could be learnt of that. Of a
+    drag for which the others were too slow eleven times as much was left in the fast run as before (1001115).
     """
     if len(blind.logs) < LEAST_RUNS_FOR_HOLDOUT_COUNT:
         return ()

@@ -182,5 +182,5 @@ def left_out(found: list[Marked], full: bool, say: Say, most: int | None, until_
         again.append(marked(one))
         right = suite_figures.left_out_right(again[-1])
         say(f"{'unknown or an alias' if right else 'MISNAMED or missed'}: {line(again[-1])}")
-    remark = f"{len(again)} effects, each on a set that hides it alone"
+    remark = f"{len(again)} effects, each on the set of those that hide it alone that no other law comes near"
     return suite_figures.left_out_figure(again, full, remark)

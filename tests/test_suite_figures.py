@@ -181,6 +181,8 @@ def test_left_out():
         one(1, "single", [found("offset"), found("coulomb_friction")], member("asymmetric_coulomb_friction"))
     )
     assert not left_out_right(one(1, "single", [found("coulomb_friction")], member("asymmetric_coulomb_friction")))
+    assert left_out_right(one(1, "single", [found("lugre_friction")], member("stribeck_friction")))
+    assert not left_out_right(one(1, "single", [found("stribeck_friction")], member("lugre_friction")))
     assert gap.without("cogging", "macro_force") == {"cogging", "harmonic_cogging"}
     assert gap.without("tilt", "macro_force") == {"gravity_tilt"}
 
