@@ -10,8 +10,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-from bench import emps_figures, final_seeds, suite_figures
-from bench.blind_names import our_keys
+from bench import emps_figures, final_seeds, left_out, suite_figures
 from bench.blind_sets import (
     Job,
     Marked,
@@ -33,7 +32,8 @@ from stagectl.gap.workflow import find
 
 ABOUT = (
     "Sets are those of `tests/blind`. A figure is missed where the 95 % interval excludes its bar; the full run judges "
-    "the value itself. Bars are written in `bench/gap.py`, `bench/suite_figures.py` and `bench/emps_figures.py`."
+    "the value itself. Bars are written in `bench/gap.py`, `bench/suite_figures.py`, `bench/left_out.py` and "
+    "`bench/emps_figures.py`."
 )
 
 SPEED = Bar("four recordings of 20 s at 1 kHz, full library, 200 nulls: time with two workers", "s", 30.0)
@@ -116,7 +116,7 @@ def _part(say: Say, until_s: float) -> Iterator[Figure]:
     jobs = [Job(seed, None, sets_folder()) for seed in PART_SEEDS]
     found = _marked(searched(jobs, workers, until_s - LEFT_OUT_S), say)
     yield from suite_figures.suite(found, full=False)
-    yield left_out(found, False, say, PART_LEFT_OUT_COUNT, until_s)
+    yield left_out.figure(found, False, say, PART_LEFT_OUT_COUNT, until_s)
     yield from suite_figures.effect_by_effect(found)
 
 
@@ -135,7 +135,7 @@ def _full(say: Say) -> Iterator[Figure]:
     found = [marked(done[seed]) for seed in sorted(done)]
     measured = [
         *suite_figures.suite(found, full=True),
-        left_out(found, True, say, None, float("inf")),
+        left_out.figure(found, True, say, None, float("inf")),
         *suite_figures.effect_by_effect(found),
     ]
     run.end(done, measured, time.monotonic() - begin_s)
@@ -160,27 +160,3 @@ def _marked(found: Iterable, say: Say) -> list[Marked]:
         result.append(marked(one))
         say(line(result[-1]))
     return result
-
-
-# ---- the library without one of its effects --------------------------------------------------------------------------
-
-
-def without(name: str, acts_on: str) -> frozenset[str]:
-    """Return the names of our effects that answer to a law of the truth."""
-    return frozenset(key[0] for key in our_keys(name, acts_on))
-
-
-def left_out(found: list[Marked], full: bool, say: Say, most: int | None, until_s: float) -> Figure:
-    """Search a single of every effect again, with a library that lacks it: the one that no other law comes near."""
-    jobs = [
-        Job(seed, None, sets_folder(), keep=not full, options=(("without", without(name, acts_on)),))
-        for name, (_, seed, acts_on) in list(suite_figures.farthest_singles(found).items())[:most]
-    ]
-    say(f"the library without one effect, {len(jobs)} times")
-    again = []
-    for one in searched(jobs, os.cpu_count() or 1, until_s):
-        again.append(marked(one))
-        right = suite_figures.left_out_right(again[-1])
-        say(f"{'unknown or an alias' if right else 'MISNAMED or missed'}: {line(again[-1])}")
-    remark = f"{len(again)} effects, each on the set of those that hide it alone that no other law comes near"
-    return suite_figures.left_out_figure(again, full, remark)

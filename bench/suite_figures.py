@@ -6,7 +6,7 @@ the sets.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +28,6 @@ COVERAGE_LIMITS = (90.0, 99.0)
 CLOSED = Bar("reducible gap closed on held-out runs, pooled", "%", 95.0, at_least=True)
 CLOSED_DECILE = Bar("the same, worst decile of sets", "%", 80.0, at_least=True)
 SET_SIZE = Bar("mean stated set over mean inseparable set", "ratio", 1.2)
-LEFT_OUT = Bar("effect taken out of the library: unknown, or its stated alias", "%", 100.0, at_least=True)
 
 CONFIDENCE = 0.95
 DRAWS_COUNT = 2000
@@ -205,61 +204,3 @@ def effect_by_effect(all_marked: Sequence[Marked]) -> Iterator[Figure]:
             f"precision {precision}, {row['rightly']} of {row['named']} names right"
         )
         yield Figure(f"recall of {name}", value, "%", "reported", None, [], text)
-
-
-# ---- an effect taken out of the library ------------------------------------------------------------------------------
-
-CONTAINED_IN: dict[str, tuple[frozenset[str], ...]] = {
-    "viscous_friction": (frozenset({"asymmetric_viscous_friction"}),),
-    "coulomb_friction": (frozenset({"asymmetric_coulomb_friction"}),),
-    "dahl_friction": (frozenset({"lugre_friction"}),),
-    "stribeck_friction": (frozenset({"lugre_friction"}),),
-    "linear_stiffness": (frozenset({"cable_spring"}), frozenset({"cable_spring", "offset"})),
-    "cable_spring": (frozenset({"linear_stiffness"}), frozenset({"linear_stiffness", "offset"})),
-}
-"""Laws, and pairs of laws, that hold another as a special case or are the same: naming them isn't wrong."""
-
-
-def farthest_singles(found: Sequence[Marked]) -> dict[str, tuple[float, int, str]]:
-    """Return (distance to the nearest other law, seed, place) of the single of every effect that is farthest from it.
-
-    What another law does as well, but for less than the floor scatters by, nobody calls unknown who has no law for it:
-    a sensor's delay of 283 deviations was a lag but for 86 squares, where the floor of a set scatters by 630 to 880.
-    """
-    farthest: dict[str, tuple[float, int, str]] = {}
-    for one in found:
-        truth = one.searched.truth
-        if truth is not None and one.mark["category"] == "single":
-            (member,) = truth["effects"]
-            own = member["nearest"][0][2], one.searched.seed, member["acts_on"]
-            farthest[member["name"]] = max(farthest.get(member["name"], own), own)
-    return farthest
-
-
-def left_out_right(one: Marked) -> bool:
-    """Tell whether a single whose law was not in the library came back as unknown or as an alias of it."""
-    if one.searched.error or one.searched.truth is None:
-        return False
-    if one.right:  # Coulomb friction and an offset are an asymmetric Coulomb friction, as the marks have it too
-        return True
-    (member,) = one.searched.truth["effects"]
-    named = one.mark["named"]
-    if not named:
-        return one.searched.findings["verdict"] == "unknown"
-    names = frozenset(found["name"] for found in named)
-    if names in CONTAINED_IN.get(member["name"], ()) and all(found["acts_on"] == member["acts_on"] for found in named):
-        return True
-    inseparable = {tuple(key) for key in member["inseparable"]}
-    return len(named) == 1 and (named[0]["name"], named[0]["acts_on"]) in inseparable
-
-
-def left_out_figure(all_marked: Sequence[Marked], full: bool, remark: str) -> Figure:
-    """Hold the share of effects that were called unknown or by an alias where the library lacks them."""
-    if not all_marked:
-        return absent(LEFT_OUT, remark)
-    right: Callable[[Marked], bool] = left_out_right
-    wrong = [one for one in all_marked if not right(one)]
-    texts = [f"{(one.searched.truth or {}).get('effects', [{'name': '?'}])[0]['name']}" for one in wrong]
-    estimate = share(len(all_marked) - len(wrong), len(all_marked))
-    more = "; ".join(part for part in (remark, f"not: {', '.join(texts)}" if texts else "") if part)
-    return judged_estimate(LEFT_OUT, estimate, sorted(one.searched.seed for one in all_marked), full, more)

@@ -10,46 +10,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bench import final_seeds, gap, suite_figures
+from bench import final_seeds, suite_figures
 from bench.blind_sets import Searched, marked
 from bench.figure import Bar
 from bench.sources import ROOT, gap_sources
 from bench.suite_figures import (
     coverage_figure,
-    farthest_singles,
     judged_estimate,
-    left_out_right,
     pooled,
     quantile,
     share,
     suite,
 )
-
-
-def member(name="coulomb_friction", inseparable=(), level_n=2.0):
-    return {
-        "name": name, "acts_on": "macro_force", "both_axes": False, "outside": False, "amplitude": "level_n",
-        "parameters": {"level_n": level_n}, "d_prime": 500.0, "limit": 0.01, "above_twice_limit": True,
-        "above_ten_times_limit": True, "inseparable": [list(key) for key in inseparable],
-    }  # fmt: skip
-
-
-def found(name="coulomb_friction", value=2.0, half=0.1, aliases=()):
-    return {
-        "name": name, "acts_on": "macro_force", "alias_set": [list(alias) for alias in aliases],
-        "parameters": {"level_n": value}, "interval": {"level_n": [value - half, value + half]},
-    }  # fmt: skip
-
-
-def one(seed, kind, effects=(), *members, reducible=(0.0, 0.0), sd=1.0, held=1, verdict=None):
-    truth = {"seed": seed, "kind": kind, "effects": list(members), "parameter_errors": []}
-    said = {
-        "verdict": verdict or ("found" if effects else "nothing"),
-        "effects": list(effects),
-        "parameter_errors": [],
-        "not_excited": [],
-    }
-    return marked(Searched(seed, truth, said, held, reducible, sd, 1.0))
+from tests.marks import found, member, one
 
 
 def figure(figures, bar):
@@ -169,41 +142,6 @@ def test_effect_by_effect():
     assert "precision 100 %, 1 of 1" in rows["recall of coulomb_friction"].reason
     assert rows["recall of offset"].value is None
     assert "0 of 2 names right" in rows["recall of offset"].reason
-
-
-def test_left_out():
-    assert left_out_right(one(1, "single", (), member(), verdict="unknown"))
-    assert not left_out_right(one(1, "single", (), member()))
-    assert left_out_right(one(1, "single", [found("offset")], member(inseparable=[("offset", "macro_force")])))
-    assert not left_out_right(one(1, "single", [found("offset")], member()))
-    assert left_out_right(one(1, "single", [found("asymmetric_viscous_friction")], member("viscous_friction")))
-    assert left_out_right(
-        one(1, "single", [found("offset"), found("coulomb_friction")], member("asymmetric_coulomb_friction"))
-    )
-    assert not left_out_right(one(1, "single", [found("coulomb_friction")], member("asymmetric_coulomb_friction")))
-    assert left_out_right(one(1, "single", [found("lugre_friction")], member("stribeck_friction")))
-    assert not left_out_right(one(1, "single", [found("stribeck_friction")], member("lugre_friction")))
-    assert gap.without("cogging", "macro_force") == {"cogging", "harmonic_cogging"}
-    assert gap.without("tilt", "macro_force") == {"gravity_tilt"}
-
-
-def test_an_effect_is_left_out_of_the_set_that_no_other_law_comes_near():
-    def single(seed, name, nearest):
-        return one(seed, "single", [found(name)], member(name) | {"nearest": nearest})
-
-    lag, mass = ["sensor_lag", "macro_sensor"], ["mass_error", "macro_force"]
-    sets = [
-        single(1, "sensor_delay", [[*lag, 9.3], [*mass, 250.0]]),
-        single(2, "sensor_delay", [[*lag, 38.3], [*mass, 40.0]]),
-        single(3, "sensor_delay", [[*lag, 0.8], [*mass, 900.0]]),
-        single(4, "coulomb_friction", [[*mass, 12.0]]),
-        one(5, "multi", [found()], member("offset"), member("tilt")),
-        one(6, "null"),
-    ]
-    assert farthest_singles(sets) == {
-        "sensor_delay": (38.3, 2, "macro_force"),
-        "coulomb_friction": (12.0, 4, "macro_force"),
-    }
 
 
 # ---- the record of the final seeds -----------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from stagectl.effects import CATALOGUE
-from stagectl.gap import balance, hypotheses, seeds
+from stagectl.gap import balance, curves, hypotheses, seeds
 from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.evidence import Added, Evidence
 from stagectl.gap.forces import Forces, scaled_forces
@@ -60,6 +60,7 @@ class Competition:
         self.evidence = evidence = Evidence(recordings, self._crew)
         self.parameters = hypotheses.parameter_terms(recordings[0])
         self.curves: list[Group] = []
+        self._finer: list[Group] = []
         self.kept: list[Group] = []
         self._sds: list[float] = []
         library: list[Group] = []
@@ -75,7 +76,7 @@ class Competition:
             return self._taken([term for term in terms if term.name not in without and term.key not in taken])
 
         library += searched([*wrong, *hypotheses.effect_terms(recordings, grids)])
-        self.curves += self._taken(list(hypotheses.curve_terms(recordings)))
+        self.curves += self._taken(list(curves.curve_terms(recordings)))
         library += searched(_periodic_terms(evidence, known_sds, np.array(self._sds)))
         evidence.finish(known_sds, nulls_count, seed)
         self._refiner: tuple[tuple[int, ...], Refiner] | None = None
@@ -149,13 +150,14 @@ class Competition:
         found = dict(zip(terms, gains, strict=True))
         return [found[asked[group.columns]] if group.columns in asked else 0.0 for group in groups]
 
-    def fine_curves(self) -> list[Group]:
-        """Return tables over position with finer steps than those that compete, and over time since a reversal."""
-        recordings = self.evidence.recordings
-        terms = [*hypotheses.fine_curve_terms(recordings), *hypotheses.reversal_curve_terms(recordings)]
-        columns = self._crew.here(self.evidence.columns_of, terms)
-        added = [Added(term, one, widest_amplitudes(term), 0) for term, one in zip(terms, columns, strict=True)]
-        return self.evidence.append_all(added)
+    def finer_curves(self) -> list[Group]:
+        """Return the curves that are asked at the end only; made once."""
+        if not self._finer:
+            terms = list(curves.finer_curve_terms(self.evidence.recordings))
+            columns = self._crew.here(self.evidence.columns_of, terms)
+            added = [Added(term, one, widest_amplitudes(term), 0) for term, one in zip(terms, columns, strict=True)]
+            self._finer = self.evidence.append_all(added)
+        return self._finer
 
     def _brought_near(self, other: Group, group: Group) -> list[Group]:
         """Return a law at the shapes at which it may be what `group` says.

@@ -1,4 +1,4 @@
-"""Everything that could be missing: effects at grids of their shape parameters, errors of known parameters, curves.
+"""Everything that could be missing and has a name: effects at grids of their shape parameters, known parameters.
 
 Each is a group of whitened columns whose amplitudes are solved for; shapes (a pitch, a Stribeck speed) are searched.
 Pure.
@@ -11,13 +11,10 @@ from functools import partial
 import numpy as np
 
 from stagectl.effects import CATALOGUE, Effect, Trait
-from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.effect_forces import between, effect_forces, known_forces, motor_forces
 from stagectl.gap.forces import Forces, add_forces, scaled_forces
-from stagectl.gap.quantities import quantities
 from stagectl.gap.reading_errors import SMALL_M, more_contact_n
 from stagectl.gap.recording import Recording, acting_on, driven_by, relative_motion
-from stagectl.gap.reversals import since_reversal
 
 
 @dataclass(frozen=True, slots=True)
@@ -385,76 +382,3 @@ def phase_of(effect: Effect, amplitude: str) -> str | None:
         if name in effect.parameters:
             return name
     return None
-
-
-_KNOTS_COUNT = 12
-_FINE_KNOTS_COUNT = 48
-_SINCE_REVERSAL = "since_reversal_s"
-_SINCE_REVERSAL_S = np.geomspace(0.02, 5.0, 16)
-_TURN_NOISES = 20.0  # of a sensor's noise, the way back from which on a body has turned round
-_LEAST_CURVE_N = 1.0  # as large as what drives, or so much: free, curves and known parameters cancel out at kilonewtons
-_CURVES = ("position_m", "velocity_m_per_s", "t_s")  # not acceleration: its line is a mass, and shrinks any rest
-
-
-def curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
-    """Yield tables over one quantity of each body: what stands for an effect that no library has."""
-    axes = recordings[0].axes
-    for axis in axes:
-        relative = ("relative_position_m",) if len(axes) > 1 else ()
-        yield from _tables(recordings, axis, (*_CURVES, *relative), _KNOTS_COUNT)
-
-
-def fine_curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
-    """Yield tables over the position of each body whose steps are a quarter of those of other curves."""
-    for axis in recordings[0].axes:
-        yield from _tables(recordings, axis, ("position_m",), _FINE_KNOTS_COUNT)
-
-
-def reversal_curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
-    """Yield tables of a friction over the time since each body turned round: what no law of speed or place can be."""
-    for axis in recordings[0].axes:
-        yield _table(recordings, axis, _SINCE_REVERSAL, _SINCE_REVERSAL_S, partial(_hats_since, axis))
-
-
-def _tables(recordings: Sequence[Recording], axis: str, over: Sequence[str], knots_count: int) -> Iterator[Term]:
-    for quantity in over:
-        spans = [quantities(r, axis, "macro_force")[quantity] for r in recordings]
-        low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
-        if not high > low:
-            continue
-        knots = np.linspace(low, high, knots_count)
-        yield _table(recordings, axis, quantity, knots, partial(_hats, axis, quantity, knots))
-
-
-def _table(
-    recordings: Sequence[Recording],
-    axis: str,
-    quantity: str,
-    knots: np.ndarray,
-    forces: Callable[[Recording], list[Forces]],
-) -> Term:
-    place = "macro_force" if axis == "macro" else "micro_force"
-    names = tuple(f"{knot:.6g}" for knot in knots)
-    commands = [r.log.macro_command_n if axis == "macro" else r.log.micro_command_n for r in recordings]
-    most_n = max(_LEAST_CURVE_N, *(float(np.std(c)) for c in commands if c is not None))
-    return Term(f"curve over {quantity}", place, {}, names, forces, bounds=((-most_n, most_n),) * knots.size)
-
-
-def _hats(axis: str, quantity: str, knots: np.ndarray, r: Recording) -> list[Forces]:
-    return _on(axis, _weights(quantities(r, axis, "macro_force")[quantity], knots))
-
-
-def _hats_since(axis: str, r: Recording) -> list[Forces]:
-    position_m = r.motion(axis).position_m
-    turn_m = _TURN_NOISES * r.belief(axis).noise_m
-    since_s, direction = since_reversal(position_m.ravel(), turn_m, r.log.period_s / PARTS_COUNT)
-    weights = _weights(np.log(np.maximum(since_s, 1e-9)), np.log(_SINCE_REVERSAL_S))
-    return _on(axis, [(direction * weight).reshape(position_m.shape) for weight in weights])
-
-
-def _weights(value: np.ndarray, knots: np.ndarray) -> list[np.ndarray]:
-    return [np.interp(value, knots, np.eye(knots.size)[k]) for k in range(knots.size)]
-
-
-def _on(axis: str, weights: Sequence[np.ndarray]) -> list[Forces]:
-    return [Forces(macro_n=weight) if axis == "macro" else Forces(end_n=weight) for weight in weights]

@@ -68,7 +68,7 @@ def finer_curve(search: Competition, chosen: list[Group], least: float) -> Group
     find 383 of 258 million and less.
     """
     now = search.judge.gain(chosen)
-    for curve in search.fine_curves():
+    for curve in search.finer_curves():
         gained = search.judge.gain([*chosen, curve]) - now
         search.judge.trace.append(f"{search.term(curve).name}, finer, on {curve.key[1]} finds {gained:.0f}")
         if gained > least + SEARCH_PRICE * len(curve.columns):

@@ -490,9 +490,9 @@ class Evidence:
             for acts_on in law.acts_on:
                 if self.case.single and acts_on.startswith(("micro", "end", "contact")):
                     continue
-                yield from self._grid(law, acts_on, hints)
+                yield from self.grid(law, acts_on, hints)
 
-    def _grid(self, law, acts_on, hints):
+    def grid(self, law, acts_on, hints):
         first = law.parameters[0]
         middle = math.sqrt(first.low * first.high)
         if law.name == "contact_damping" and self.case.uncertainty.get("contact_damping_n_s_per_m", 0.0) > 0.0:

@@ -1,0 +1,94 @@
+"""The library without one effect: which set it is asked of, and which answers are right."""
+
+import math
+
+import pytest
+
+from bench import left_out
+from bench.left_out import farthest_singles, is_right, is_together, without
+from tests.blind import detection, draw, together
+from tests.marks import found, member, one
+
+
+def test_unknown_an_alias_or_a_law_that_holds_it_is_right():
+    assert is_right(one(1, "single", (), member(), verdict="unknown"))
+    assert not is_right(one(1, "single", (), member()))
+    assert is_right(one(1, "single", [found("offset")], member(inseparable=[("offset", "macro_force")])))
+    assert not is_right(one(1, "single", [found("offset")], member()))
+    assert is_right(one(1, "single", [found("asymmetric_viscous_friction")], member("viscous_friction")))
+    asymmetric = member("asymmetric_coulomb_friction")
+    assert is_right(one(1, "single", [found("offset"), found("coulomb_friction")], asymmetric))
+    tilt = found("tilt", aliases=[("offset", "macro_force")])
+    assert is_right(one(1, "single", [tilt, found("coulomb_friction")], asymmetric))
+    elsewhere = found("tilt", aliases=[("offset", "micro_force")])
+    assert not is_right(one(1, "single", [elsewhere, found("coulomb_friction")], asymmetric))
+    assert not is_right(one(1, "single", [found("coulomb_friction")], asymmetric))
+    assert is_right(one(1, "single", [found("lugre_friction")], member("stribeck_friction")))
+    assert not is_right(one(1, "single", [found("stribeck_friction")], member("lugre_friction")))
+
+
+def test_our_names_of_a_law_of_the_truth():
+    assert without("cogging", "macro_force") == {"cogging", "harmonic_cogging"}
+    assert without("tilt", "macro_force") == {"gravity_tilt"}
+
+
+def test_an_effect_is_left_out_of_the_set_that_no_other_law_comes_near():
+    def single(seed, name, nearest):
+        return one(seed, "single", [found(name)], member(name) | {"nearest": nearest})
+
+    lag, mass = ["sensor_lag", "macro_sensor"], ["mass_error", "macro_force"]
+    sets = [
+        single(1, "sensor_delay", [[*lag, 9.3], [*mass, 250.0]]),
+        single(2, "sensor_delay", [[*lag, 38.3], [*mass, 40.0]]),
+        single(3, "sensor_delay", [[*lag, 0.8], [*mass, 900.0]]),
+        single(4, "coulomb_friction", [[*mass, 12.0]]),
+        one(5, "multi", [found()], member("offset"), member("tilt")),
+        one(6, "null"),
+    ]
+    assert farthest_singles(sets) == {
+        "sensor_delay": (38.3, 2, "macro_force"),
+        "coulomb_friction": (12.0, 4, "macro_force"),
+    }
+
+
+def test_the_share_of_right_answers_is_held_against_its_bar():
+    sets = [one(1, "single", (), member("tilt")), one(2, "single", (), member("offset"))]
+    figure = left_out.judged(sets, [False, True], full=True)
+    assert (figure.value, figure.holds) == (pytest.approx(50.0), False)
+    assert "not: tilt" in figure.reason
+    assert left_out.judged(sets, [True, True], full=True).holds
+    assert left_out.judged([], [], full=True).value is None
+
+
+# ---- laws that are together another one ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tilted():
+    return draw.draw(90, "single", 5.0)
+
+
+def test_two_offsets_are_a_tilt_and_one_is_not(tilted):
+    assert [effect.law.name for effect in tilted.effects] == ["tilt"]
+    alone = together.distance(tilted, [])
+    assert together.distance(tilted, [("offset", "macro_force"), ("offset", "micro_force")]) < 1e-3 * alone
+    assert detection.SEPARABLE_D < together.distance(tilted, [("offset", "macro_force")]) < alone
+
+
+def test_a_cable_that_is_anchored_far_away_is_an_offset(tilted):
+    assert together.distance(tilted, [("offset", "macro_force"), ("cable_spring", "micro_force")]) < 0.1
+
+
+def test_viscous_and_coulomb_friction_are_no_drag():
+    drag = draw.draw(95, "single", 5.0)
+    assert [effect.law.name for effect in drag.effects] == ["quadratic_drag"]
+    two = together.distance(drag, [("viscous_friction", "macro_force"), ("coulomb_friction", "macro_force")])
+    assert detection.SEPARABLE_D < two < together.distance(drag, [("viscous_friction", "macro_force")])
+
+
+def test_a_law_that_the_generator_has_not_is_infinitely_far(tilted):
+    assert together.distance(tilted, [("force_over_position", "macro_force")]) == math.inf
+
+
+def test_an_answer_without_names_is_no_law_together():
+    assert not is_together(one(1, "single", (), member(), verdict="unknown"))
