@@ -46,8 +46,9 @@ CURVE = {
     "over": "position_m",
     "acts_on": "macro_force",
     "knots": [float(f"{-0.1 + 0.03 * k / 11:.6g}") for k in range(12)],
-    "values_n": [0.1 * k * k for k in range(12)],
-    "sds_n": [0.01] * 12,
+    "unit": "N",
+    "values": [0.1 * k * k for k in range(12)],
+    "sds": [0.01] * 12,
     "gain": 90.0,
     "held_out_gain": 40.0,
 }
@@ -273,7 +274,7 @@ def test_an_unknown_curve_becomes_a_table_without_a_name():
     values = np.array([*(row[name] for name in CATALOGUE["force_over_position"].parameters), 0.0])
     knots = np.array(CURVE["knots"])
     found = along(np.concatenate([knots, 0.5 * (knots[1:] + knots[:-1])])[:, None], values, np.zeros(1))
-    assert found[:12] == pytest.approx(CURVE["values_n"], abs=2e-3)
+    assert found[:12] == pytest.approx(CURVE["values"], abs=2e-3)
     assert found[12:] == pytest.approx([0.1 * (k * k + k + 0.5) for k in range(11)], abs=2e-3)
     assert "unknown, a table of its curve and no name" in text
     assert "(95 %)" in _line(text, "force_12_n")
@@ -282,9 +283,15 @@ def test_an_unknown_curve_becomes_a_table_without_a_name():
     timely = dataclasses.replace(findings, unknown=CURVE | {"over": "t_s"})
     with pytest.raises(RequestError, match="over t_s: it is of one recording"):
         applied(_text(AXIS), timely, candidates=True, date=DATE)
-    turning = dataclasses.replace(findings, unknown=CURVE | {"over": "since_reversal_s"})
-    with pytest.raises(RequestError, match="over since_reversal_s: no table of a profile goes by it"):
-        applied(_text(AXIS), turning, candidates=True, date=DATE)
+    uneven = {"knots": [0.02, 0.1, 5.0], "values": [0.1, 0.2, 0.1], "sds": [0.01] * 3}
+    for other in (
+        CURVE | {"over": "since_reversal_s"} | uneven,
+        CURVE | {"over": "motor_force_ago_s", "unit": "ratio", "acts_on": "macro_actuator"} | uneven,
+        CURVE | {"unit": "m", "acts_on": "macro_sensor"},
+    ):
+        changed = dataclasses.replace(findings, unknown=other)
+        with pytest.raises(RequestError, match=f"over {other['over']}: no table of a profile goes by it"):
+            applied(_text(AXIS), changed, candidates=True, date=DATE)
 
 
 def test_comments_survive_where_values_stand_in_one_line():
@@ -327,7 +334,8 @@ def test_comments_survive_where_values_stand_in_one_line():
         ({}, "the findings name nothing$"),
         ({"unknown": {"over": "position_m"}}, "damaged.*the unknown curve lacks acts_on"),
         ({"unknown": CURVE | {"knots": [0.0, *CURVE["knots"][1:]]}}, "damaged.*uneven steps"),
-        ({"unknown": CURVE | {"values_n": [1.0]}}, "damaged.*has not 12 numbers"),
+        ({"unknown": CURVE | {"values": [1.0]}}, "damaged.*has not 12 numbers"),
+        ({"unknown": CURVE | {"unit": "m", "sds": [1.0]}}, "damaged.*has not 12 numbers"),
         ({"unknown": CURVE}, "nothing to write.*unknown curve over position_m: a table.*--candidates"),
         ({"named": (dataclasses.replace(OFFSET, confirmed=False),)}, "none of 1 findings is confirmed.*--candidates"),
     ],

@@ -8,7 +8,7 @@ from pathlib import PurePath
 from typing import Any
 
 from stagectl.effects import CATALOGUE
-from stagectl.effects.table import KNOTS_COUNT
+from stagectl.effects.table import KNOTS_COUNT, TABLES
 from stagectl.errors import ProfileError, RequestError
 from stagectl.gap import addition
 from stagectl.gap.findings import Findings
@@ -78,13 +78,21 @@ def refuse_damaged(findings: Findings) -> None:
 
 
 def _curve_problem(unknown: Mapping[str, Any]) -> str:
-    if strange := [name for name in ("over", "acts_on", "knots", "values_n", "sds_n") if name not in unknown]:
+    if strange := [name for name in ("over", "acts_on", "unit", "knots", "values", "sds") if name not in unknown]:
         return f"lacks {strange[0]}"
-    lists = [unknown[name] for name in ("knots", "values_n", "sds_n")]
-    if not all(isinstance(one, list) and len(one) == KNOTS_COUNT and _are_numbers(one) for one in lists):
-        return f"has not {KNOTS_COUNT} numbers in knots, values_n and sds_n"
+    lists = [unknown[name] for name in ("knots", "values", "sds")]
+    count = KNOTS_COUNT if is_tabled(unknown) else len(lists[0])
+    if not all(isinstance(one, list) and len(one) == count and _are_numbers(one) for one in lists):
+        return f"has not {count} numbers in knots, values and sds"
     steps = [after - before for before, after in itertools.pairwise(lists[0])]
-    return "" if 0.0 < max(steps) < (1.0 + _EVEN_RATIO) * min(steps) else "has knots at uneven steps"
+    if is_tabled(unknown) and not 0.0 < max(steps) < (1.0 + _EVEN_RATIO) * min(steps):
+        return "has knots at uneven steps"
+    return ""
+
+
+def is_tabled(unknown: Mapping[str, Any]) -> bool:
+    """Tell whether a profile has a table of what a curve goes by: of a force over some quantities."""
+    return unknown["unit"] == "N" and unknown["over"] in TABLES.values()
 
 
 def _are_numbers(values: list[Any]) -> bool:

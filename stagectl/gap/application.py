@@ -14,7 +14,7 @@ from tomlkit.exceptions import TOMLKitError
 from stagectl.effects import CATALOGUE
 from stagectl.effects.table import TABLES
 from stagectl.errors import ProfileError, RequestError
-from stagectl.gap.applicable import origin_of, refuse_damaged, refuse_other_profile
+from stagectl.gap.applicable import is_tabled, origin_of, refuse_damaged, refuse_other_profile
 from stagectl.gap.findings import Findings, Named
 from stagectl.gap.parameter_application import parameters_of_keys, write_parameter, write_refitted
 from stagectl.gap.profile_sheet import Change, Sheet, below_title, mark_of, plain
@@ -103,16 +103,16 @@ def _write_effect(sheet: Sheet, effect: Named) -> None:
 def _write_table(sheet: Sheet, unknown: Mapping[str, Any]) -> None:
     """Write the curve of an unknown force as a table; it names nothing."""
     over = unknown["over"]
-    name = next((table for table, quantity in TABLES.items() if quantity == over), None)
-    if name is None:
+    if not is_tabled(unknown):
         why = "it is of one recording, a profile can't hold it" if over == "t_s" else "no table of a profile goes by it"
         sheet.left.append(f"the unknown curve over {over}: {why}")
         return
     knots = unknown["knots"]
     step = (knots[-1] - knots[0]) / (len(knots) - 1)
+    name = next(table for table, quantity in TABLES.items() if quantity == over)
     known = CATALOGUE[name]
     values = [(knots[0], None), (step, None)]
-    values += [(v, SIGMAS * sd) for v, sd in zip(unknown["values_n"], unknown["sds_n"], strict=True)]
+    values += [(v, SIGMAS * sd) for v, sd in zip(unknown["values"], unknown["sds"], strict=True)]
     key, table = sheet.add_effect(f"{sheet.mark}: unknown, a table of its curve and no name; not confirmed")
     table["name"] = name
     table["acts_on"] = unknown["acts_on"]

@@ -54,6 +54,13 @@ def finer_curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
         yield from _misread_over_position(recordings, axis)
 
 
+def unit_of(term: Term) -> str:
+    """Return what the values of a curve are: N of a force, m of a reading, a ratio of a motor's force."""
+    if term.name == f"curve over {AGO}":
+        return "ratio"
+    return "m" if term.acts_on.endswith("_sensor") else "N"
+
+
 def _over(recordings: Sequence[Recording], axis: str, quantity: str, knots_count: int) -> Iterator[Term]:
     """Yield the table over one quantity of a body; none where that never changes."""
     knots = _even(recordings, axis, "macro_force", quantity, knots_count)

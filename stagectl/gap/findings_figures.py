@@ -133,18 +133,19 @@ def frequency_figure(residuals: Sequence[Residual], image_format: str = "svg") -
 
 
 def unknown_figure(unknown: dict[str, Any], image_format: str = "svg") -> bytes:
-    """The curve of what repeats and no effect explains, with its 95 % band."""
+    """The curve of what repeats and no effect explains, with its 95 % band: a force, a reading, or when one is felt."""
     with matplotlib.rc_context(STYLE):
         drawing, (axes,) = panels_of(2.9, 1, 1)
         scale, label = _QUANTITIES.get(unknown["over"], (1.0, unknown["over"]))
         knots = np.asarray(unknown["knots"], float) * scale
-        values, half = np.asarray(unknown["values_n"], float), 1.96 * np.asarray(unknown["sds_n"], float)
+        unit, words, what = _CURVES[unknown["unit"]]
+        values, half = unit * np.asarray(unknown["values"], float), 1.96 * unit * np.asarray(unknown["sds"], float)
         axes.fill_between(knots, values - half, values + half, color=_AFTER, alpha=0.22, linewidth=0.0)
-        axes.plot(knots, values, color=_AFTER, marker="o", markersize=3.5, label="force that no effect explains")
+        axes.plot(knots, values, color=_AFTER, marker="o", markersize=3.5, label=f"{what} that no effect explains")
         axes.plot([], [], color=_AFTER, alpha=0.3, linewidth=6.0, label="95 % band")
         axes.axhline(0.0, color=MUTED, linewidth=0.6)
         axes.set_xlabel(label)
-        axes.set_ylabel("force (N)")
+        axes.set_ylabel(words)
         legend(drawing, axes, columns=2)
         return image_of(drawing, image_format)
 
@@ -155,7 +156,15 @@ _QUANTITIES = {
     "relative_position_m": (1e6, "end minus macro (µm)"),
     "t_s": (1.0, "time (s)"),
     "since_reversal_s": (1.0, "time since the last reversal (s)"),
+    "motor_force_ago_s": (1e3, "time since the motor's force (ms)"),
 }
+
+_CURVES = {
+    "N": (1.0, "force (N)", "force"),
+    "m": (1e6, "read too much (µm)", "reading"),
+    "ratio": (1.0, "felt of the motor's force (ratio)", "answer"),
+}
+"""By a curve's unit: its scale, the label of its axis, what it is."""
 
 
 def _force_rows(residuals: Sequence[Residual]) -> list[dict[str, Any]]:

@@ -286,9 +286,9 @@ def _figures(findings: Findings, residuals: Sequence[Residual]) -> list[Figure]:
             Figure(
                 "What no effect explains",
                 findings_figures.unknown_figure(findings.unknown),
-                f"The force that repeats on runs that no fit saw, {where}, with its 95 % band. It has no name; a table "
-                "of it never counts as one.",
-                f"Curve {where}: {_range_words(findings.unknown['values_n'])}.",
+                f"{_CURVES[findings.unknown['unit']]}, {where}, with its 95 % band. It has no name; a table of it "
+                "never counts as one.",
+                f"Curve {where}: {_range_words(findings.unknown['values'], findings.unknown['unit'])}.",
             )
         )
     for axis in axes:
@@ -361,8 +361,18 @@ def _force_words(residuals: Sequence[Residual]) -> str:
     return "; ".join(said) + "."
 
 
-def _range_words(values: Sequence[float]) -> str:
-    return f"from {Quantity(min(values), 'N')} to {Quantity(max(values), 'N')}"
+_CURVES = {
+    "N": "The force that repeats on runs that no fit saw",
+    "m": "What the sensor reads too much in all runs",
+    "ratio": "What the body feels of its motor's force of so long ago, beyond what is known of its drive",
+}
+"""What a curve shows, by its unit."""
+
+
+def _range_words(values: Sequence[float], unit: str) -> str:
+    if unit == "ratio":
+        return f"from {min(values):.3g} to {max(values):.3g}"
+    return f"from {Quantity(min(values), unit)} to {Quantity(max(values), unit)}"
 
 
 # ---- sentences --------------------------------------------------------------------------------------------------
