@@ -316,12 +316,11 @@ def _effects(named: Sequence[Named]) -> list[dict[str, Any]]:
         if translation is None:
             found.append({"name": one.name, "acts_on": acts_on, "alias_set": _aliases(one), "parameters": {}})
             continue
-        values, sds, shared = _plain(one)
+        sizes = _plain(one)
         aliases = _aliases(one)
         for other in left:
             if other is not one and (other.name, other.acts_on) == (translation.beside, one.acts_on):
-                more, more_sds, more_shared = _plain(other)
-                values, sds, shared = more | values, more_sds | sds, more_shared | shared
+                sizes = sizes.beside(_plain(other))
                 left = [kept for kept in left if kept is not other]
                 found = [kept for kept in found if (kept["name"], kept["acts_on"]) != (other.name, acts_on)]
                 aliases = [alias for alias in aliases if tuple(alias) != (translation.beside, acts_on)]
@@ -333,8 +332,8 @@ def _effects(named: Sequence[Named]) -> list[dict[str, Any]]:
                 "name": translation.truth,
                 "acts_on": acts_on,
                 "alias_set": [alias for alias in aliases if tuple(alias) != own],
-                "parameters": _finite({key: read(values) for key, read in translation.parameters.items()}),
-                "interval": _intervals(translation, values, sds, shared),
+                "parameters": _finite({key: read(sizes.values) for key, read in translation.parameters.items()}),
+                "interval": _intervals(translation, sizes),
             }
         )
     return found
@@ -345,11 +344,27 @@ def _aliases(one: Named) -> list[list[str]]:
     return [list(key) for key in keys if key != truth_key(one.name, one.acts_on)]
 
 
-def _plain(one: Named) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-    """Pool what was fitted session by session, or run by run, into one value each: the truth has one amplitude.
+@dataclass(frozen=True, slots=True)
+class _Sizes:
+    """Values, their own deviations, what they are uncertain by together, as ratios, and how own errors go together."""
 
-    Returns (values, their own deviations, what they are uncertain by together, as ratios).
-    """
+    values: dict[str, float]
+    sds: dict[str, float]
+    shared: dict[str, float]
+    correlations: dict[tuple[str, str], float]
+
+    def beside(self, other: "_Sizes") -> "_Sizes":
+        """Return these and those of another law, of which these stand where both have a name."""
+        return _Sizes(
+            other.values | self.values,
+            other.sds | self.sds,
+            other.shared | self.shared,
+            {two: one for two, one in other.correlations.items() if not {*two} & {*self.values}} | self.correlations,
+        )
+
+
+def _plain(one: Named) -> _Sizes:
+    """Pool what was fitted session by session, or run by run, into one value each: the truth has one amplitude."""
     values: dict[str, float] = {}
     sds: dict[str, float] = {}
     by_name: dict[str, list[tuple[float, float]]] = {}
@@ -360,31 +375,40 @@ def _plain(one: Named) -> tuple[dict[str, float], dict[str, float], dict[str, fl
             by_name.setdefault(name, []).append((value, sd))
         elif not place:
             values[name] = value
+    common = one.common_sd_ratio
     for name, pairs in by_name.items():
-        values[name], sd = pooled([value for value, _ in pairs], [sd for _, sd in pairs], one.common_sd_ratio)
-        sds[name] = own_sd(values[name], sd, one.common_sd_ratio)
-    return values, sds, dict.fromkeys(sds, one.common_sd_ratio)
+        values[name], sd = pooled([value for value, _ in pairs], [sd for _, sd in pairs], common)
+        sds[name] = own_sd(values[name], sd, common)
+    correlations = {}
+    for first, second, correlation in one.correlations:
+        if first in sds and second in sds:  # of what was fitted once for all
+            own = correlation * one.sds[first] * one.sds[second] - common**2 * values[first] * values[second]
+            correlations[first, second] = max(-1.0, min(1.0, own / (sds[first] * sds[second])))
+    return _Sizes(values, sds, dict.fromkeys(sds, common), correlations)
 
 
 def _finite(values: dict[str, float]) -> dict[str, float]:
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
-def _intervals(
-    translation: Translation, values: Mapping[str, float], sds: Mapping[str, float], shared: Mapping[str, float]
-) -> dict[str, tuple[float, float]]:
-    """Carry 95 % intervals over by the slopes of each reading: root of the sum of squares of its parts.
+def _intervals(translation: Translation, sizes: _Sizes) -> dict[str, tuple[float, float]]:
+    """Carry 95 % intervals over by the slopes of each reading: root of the sum of squares of its parts and of products.
 
     What all values are uncertain by together is one of the parts: two levels of a friction that are both as uncertain
-    as the scale of forces is have a mean that is no less so, and a ratio that is not.
+    as the scale of forces is have a mean that is no less so, and a ratio that is not. Two that both are what a stated
+    friction may be wrong by have no better mean either: 11.7 +- 5.3 was stated where 18.1 was true.
     """
+    values = sizes.values
     found: dict[str, tuple[float, float]] = {}
-    together = {key: values[key] * (1.0 + ratio) for key, ratio in shared.items() if key in values}
+    together = {key: values[key] * (1.0 + ratio) for key, ratio in sizes.shared.items() if key in values}
     for name, read in translation.parameters.items():
         centre = read(values)
-        parts = [read({**values, key: values[key] + sd}) - centre for key, sd in sds.items() if key in values]
-        parts.append(read({**values, **together}) - centre)
-        spread = math.sqrt(sum(part * part for part in parts)) * Z_95
+        parts = {
+            key: read({**values, key: values[key] + sd}) - centre for key, sd in sizes.sds.items() if key in values
+        }
+        variance = sum(part * part for part in parts.values()) + (read({**values, **together}) - centre) ** 2
+        variance += 2.0 * sum(r * parts[a] * parts[b] for (a, b), r in sizes.correlations.items())
+        spread = math.sqrt(max(variance, 0.0)) * Z_95
         if math.isfinite(centre) and spread > 0.0 and math.isfinite(spread):
             found[name] = (centre - spread, centre + spread)
     return found

@@ -314,6 +314,27 @@ def test_no_mean_is_better_known_than_what_its_parts_have_in_common():
     assert high - low == pytest.approx(2.0 * 1.96 * math.hypot(9e-3 / 8.0, 3.0 * 3e-3 / 8.0), rel=0.01)
 
 
+def test_the_mean_of_two_that_are_wrong_together_is_no_better_known():
+    """Both directions of a friction are what they are beyond one that is stated with 0.04 N s/m."""
+    dragging = named(
+        "asymmetric_viscous_friction",
+        "macro_force",
+        {"forward_n_s_per_m": 25.0, "backward_n_s_per_m": -1.5},
+        {"forward_n_s_per_m": 0.04, "backward_n_s_per_m": 0.04},
+    )
+    for correlation, mean_sd, half_difference_sd in (
+        (1.0, 0.04, 0.0),
+        (0.0, 0.04 / math.sqrt(2.0), 0.04 / math.sqrt(2.0)),
+    ):
+        pair = (("forward_n_s_per_m", "backward_n_s_per_m", correlation),)
+        (one,) = translated(dataclasses.replace(dragging, correlations=pair))
+        low, high = one["interval"]["coefficient_n_s_per_m"]
+        assert high - low == pytest.approx(2.0 * 1.96 * mean_sd, rel=1e-3)
+        low, high = one["interval"]["asymmetry"]
+        slope = math.hypot(half_difference_sd / 11.75, 13.25 * mean_sd / 11.75**2)
+        assert high - low == pytest.approx(2.0 * 1.96 * slope, rel=0.01)
+
+
 @pytest.mark.parametrize("value", [0.0, -1e9, 1e9, float("inf"), float("nan")])
 def test_no_value_is_too_odd_to_be_translated(value):
     """A tool without bounds fits a tilt of sine 5: it is named, and has no angle."""

@@ -442,6 +442,10 @@ def test_a_sum_of_amplitudes_is_as_uncertain_as_both_together():
     assert sd < 0.2 * min(float(sds[0]) for _, sds in alone)
     one = solve([*judge.base, twins[0]], judge.training)
     assert one.total_of(twins[:1])[1] == pytest.approx(float(one.of(twins[0])[1][0]))
+    first, second = (np.array([float(slot[0] in twin.columns) for slot in solution.slots]) for twin in twins)
+    together = solution.covariance_of(first, second)
+    assert sd**2 == pytest.approx(solution.sd_of(first) ** 2 + solution.sd_of(second) ** 2 + 2.0 * together)
+    assert together < -0.9 * solution.sd_of(first) * solution.sd_of(second)
 
 
 def test_one_elimination_gives_what_solving_anew_gives():

@@ -24,6 +24,7 @@ class Named:
     aliases: tuple[tuple[str, str, float], ...]
     confirmed: bool = False
     common_sd_ratio: float = 0.0  # what all of `sds` hold in common: of the scale of forces; 0 in older findings
+    correlations: tuple[tuple[str, str, float], ...] = ()  # of the errors of pairs of `sds`; none in older findings
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,9 @@
 """What was chosen, in words and numbers: effects by name, known parameters by their errors. Pure."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -30,14 +32,11 @@ def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
         if term.acts_on == "parameter":
             continue
         rest = judge.gains([other for other in chosen if other is not group])
-        parameters, sds, common = _sized(search, solution, group)
         found.append(
             Named(
                 name=term.name,
                 acts_on=term.acts_on,
-                parameters=parameters,
-                sds=sds,
-                common_sd_ratio=common,
+                **_sized(search, solution, group),
                 gain=whole[0] - rest[0],
                 held_out_gain=whole[1] - rest[1],
                 aliases=tuple((*key, margin) for key, margin in judge.aliases(chosen, group)),
@@ -57,13 +56,12 @@ def measured(
         if group is None:
             found.append(one)
         else:
-            parameters, sds, common = _sized(search, solution, group)
-            found.append(replace(one, parameters=parameters, sds=sds, common_sd_ratio=common))
+            found.append(replace(one, **_sized(search, solution, group)))
     return tuple(found)
 
 
-def _sized(search: Competition, solution: Solution, group: Group) -> tuple[dict[str, float], dict[str, float], float]:
-    """Return the parameters of an effect, the deviations of those that were solved for, and their common share.
+def _sized(search: Competition, solution: Solution, group: Group) -> dict[str, Any]:
+    """Return what `Named` says of sizes: parameters, deviations of those that were solved for, what goes together.
 
     What no size is known better than is common, too: the mean over five runs is no better.
     """
@@ -74,14 +72,20 @@ def _sized(search: Competition, solution: Solution, group: Group) -> tuple[dict[
         scale = _scale_of_forces(search, solution, term)
     factor = 1.0 + float(scale @ solution.values)
     parameters |= {name: factor * parameters[name] for name in slopes}
-    sds = {
-        name: float(
-            np.hypot(solution.sd_of(factor * slope + parameters[name] * scale), INEXACT_RATIO * parameters[name])
-        )
-        for name, slope in slopes.items()
+    weights = {name: factor * slope + parameters[name] * scale for name, slope in slopes.items()}
+    inexact = {name: INEXACT_RATIO * parameters[name] for name in slopes}
+    sds = {name: float(np.hypot(solution.sd_of(weights[name]), inexact[name])) for name in slopes}
+
+    def correlation(one: str, other: str) -> float:
+        together = solution.covariance_of(weights[one], weights[other]) + inexact[one] * inexact[other]
+        return float(together / max(sds[one] * sds[other], 1e-300))
+
+    return {
+        "parameters": term.shape | parameters if term.linear else parameters,
+        "sds": sds,
+        "common_sd_ratio": float(np.hypot(solution.sd_of(scale), INEXACT_RATIO)),
+        "correlations": tuple((*two, correlation(*two)) for two in itertools.combinations(slopes, 2)),
     }
-    common = float(np.hypot(solution.sd_of(scale), INEXACT_RATIO))
-    return (term.shape | parameters if term.linear else parameters), sds, common
 
 
 _MOTOR_QUANTITIES = {

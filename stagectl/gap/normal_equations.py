@@ -78,6 +78,10 @@ class Solution:
         variances = [float(weights @ one @ weights) for one in (self.covariance, *self.scattered)]
         return float(np.sqrt(max(*variances, 0.0)))
 
+    def covariance_of(self, weights: np.ndarray, others: np.ndarray) -> float:
+        """Return the covariance of two weighted sums of all amplitudes, by what their sum and difference scatter."""
+        return 0.25 * (self.sd_of(weights + others) ** 2 - self.sd_of(weights - others) ** 2)
+
     def total_of(self, groups: Sequence[Group]) -> tuple[float, float]:
         """Return the sum of the first amplitudes of some groups, and its standard deviation."""
         columns = {group.columns[0] for group in groups}
