@@ -157,6 +157,7 @@ _QUANTITIES = {
     "t_s": (1.0, "time (s)"),
     "since_reversal_s": (1.0, "time since the last reversal (s)"),
     "motor_force_ago_s": (1e3, "time since the motor's force (ms)"),
+    "penetration_velocity_m_per_s": (1e3, "closing speed in contact (mm/s)"),
 }
 
 _CURVES = {

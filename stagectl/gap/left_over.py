@@ -19,6 +19,11 @@ _EXACT_CURVE_SHARE = 5e-4
 to 55 million squares curves found 122 and less, and 2100 and less were left, two and a half deviations of the floor. A
 Dahl friction in the place of bristles had left 34 000 of 2.2 million, which was no rest by the others."""
 
+_FINER_GAIN = 2.0
+"""Of what the best of the library gains on noise, what a finer curve finds at least, beside what its numbers gain on
+noise: beside right names of 5800 squares to 55 million they found 40 and less of what is late, 122 of what turns round
+where 55 million were explained; beside five names in the place of a clock of 6000 squares 63."""
+
 _CROWD_COUNT = 3
 """So many names on one body that a single curve does as well as are one effect that has no name: a spring with a dead
 zone came out as a spring, a cable that slips, a cogging as long as the travel and an offset, 4 squares of 107 000
@@ -59,9 +64,9 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
         (_EXACT_LEFT_SHARE, _EXACT_CURVE_SHARE) if _are_exact(search, chosen) else (_LEFT_SHARE, _CURVE_SHARE)
     )
     floor = _LEFT_SDS * noise + left_share * max(first, 0.0)
-    least = max(CURVE_GAIN * judge.threshold, curve_share * max(first, 0.0))
-    if not left > floor and not gained > least:
-        finer = finer_curve(search, chosen, least)
+    material = curve_share * max(first, 0.0)
+    if not left > floor and not gained > max(CURVE_GAIN * judge.threshold, material):
+        finer = finer_curve(search, chosen, max(_FINER_GAIN * judge.threshold, material))
         if finer is None:
             return None
         if finer.key not in {curve.key for curve in search.curves}:  # of place there is a coarse one, as tables are
