@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from stagectl.effects.table import KNOTS_COUNT
 from stagectl.gap.command_path import PARTS_COUNT
@@ -134,6 +135,7 @@ def _misread_over_position(recordings: Sequence[Recording], axis: str) -> Iterat
     """Yield what a sensor reads too much over where it is.
 
     An Abbe error of 121 000 squares, of which five names on five places had left 1600, was found by none of the forces.
+    It is smooth: where a line turns into another one, a reading of 5 nm would have to jump by 0.1 mm/s.
     """
     place = f"{axis}_sensor"
     knots = _even(recordings, axis, place, "position_m", KNOTS_COUNT)
@@ -142,7 +144,8 @@ def _misread_over_position(recordings: Sequence[Recording], axis: str) -> Iterat
 
 
 def _misread(axis: str, place: str, knots: np.ndarray, r: Recording) -> list[Forces]:
-    return [misread(r, axis, one, whole=False) for one in _weights(quantities(r, axis, place)["position_m"], knots)]
+    through = CubicSpline(knots, np.eye(knots.size), bc_type="natural")(quantities(r, axis, place)["position_m"][:, 0])
+    return [misread(r, axis, one[:, None], whole=False) for one in through.T]
 
 
 def _over_closing(recordings: Sequence[Recording]) -> Iterator[Term]:
