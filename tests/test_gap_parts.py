@@ -527,7 +527,7 @@ LEAST_SQUARES = 500.0
     [
         ({"ripple_n": 0.5}, ("curve over position_m", "macro_force")),
         ({"growing_n": 0.8}, ("curve over since_reversal_s", "macro_force")),
-        ({"late_ratio": 0.9}, ("curve over motor_force_ago_s", "macro_actuator")),
+        ({"late_ratio": 0.82}, ("curve over motor_force_ago_s", "macro_actuator")),
         ({"bent_m": 4.5e-5}, ("curve over position_m", "macro_sensor")),
         ({}, None),
     ],
