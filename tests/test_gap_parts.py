@@ -284,6 +284,24 @@ def test_what_training_leaves_open_is_not_foretold_of_recordings_that_no_fit_saw
     assert after == pytest.approx(touching, rel=0.15)
 
 
+@pytest.mark.parametrize(("level", "names"), [(0.5, {"friction"}), (-0.5, set())])
+def test_levels_that_drive_together_are_no_friction(level, names):
+    """Two directions that an offset tells apart badly: each is within two deviations of none, their mean is not."""
+
+    def draw(run, random):
+        turning, still = random.standard_normal(4000), np.ones(4000)
+        forward, backward = still + 0.05 * turning, -still + 0.05 * turning
+        return [random.standard_normal(4000) + level * 0.1 * turning, forward, backward, 100.0 * still]
+
+    levels = Group(("friction", "macro_force"), (1, 2), bounds=((0.0, 10.0), (0.0, 10.0)))
+    judge = _table_judge(draw, [levels], base=[Group(("offset", "macro_force"), (3,), prior_sds=(1.0,))])
+    solution = solve([*judge.base, levels], judge.source.sums)
+    values, sds = solution.of(levels)
+    assert np.all(np.abs(values - level) < 3.0 * sds)
+    assert np.all(sds > 0.5 * abs(level))
+    assert {group.key[0] for group in judge.select()} == names
+
+
 def test_two_that_only_stand_together_are_found():
     """What one recording shows the sum of and another both of: each alone is a compromise that both speak against."""
 

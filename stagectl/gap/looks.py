@@ -103,11 +103,19 @@ def looked_closely(
             break
         course = further
     belief = belief_under(first, look.search, crew)
-    if unknown_rest(look.search, look.chosen, excess(belief, [])) and not unknown_rest(
-        first, course.plain.chosen, excess(first.judge, [])
-    ):
-        look, belief = course.plain, first.judge  # the first look had reached the floor
+    if unknown_rest(look.search, look.chosen, excess(belief, [])) and _has_reached_floor(course.plain, look):
+        look, belief = course.plain, first.judge
     return _measured(look)._replace(belief=belief)
+
+
+def _has_reached_floor(plain: Look, look: Look) -> bool:
+    """Tell whether the first look leaves nothing unknown, and less than a closer one.
+
+    Edges that wear were a wider gap to it, of which it left 1294 squares; along the motion under that 1116 were left,
+    and how fast the joint closes found 635 of them.
+    """
+    left, first = excess(plain.search.judge, plain.chosen), excess(plain.search.judge, [])
+    return left < excess(look.search.judge, look.chosen) and unknown_rest(plain.search, plain.chosen, first) is None
 
 
 def _taken(case: _Case, course: _Course) -> tuple[Look, tuple[Named, ...]]:

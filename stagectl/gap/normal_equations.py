@@ -126,7 +126,23 @@ def within_bounds(solution: Solution, scale_sd_ratio: float = 0.0) -> bool:
             below, above = (_BOUND_SDS * np.hypot(sd, scale_sd_ratio * bound) for bound in (low, high))
             if not low - below <= value <= high + above:
                 return False
-    return True
+    return not any(_drives(solution, group) for group in solution.groups)
+
+
+def _drives(solution: Solution, group: Group) -> bool:
+    """Tell whether the levels of a friction are less than none together, by more than twice the deviation of their sum.
+
+    Each alone may be: of two directions that an offset tells apart, -2.7 and -5.1 mN were within 3.6 of none, and their
+    mean was six deviations below it.
+    """
+    if len(group.columns) < 2 or not group.bounds or any(low != 0.0 for low, _ in group.bounds):
+        return False
+    for scope in {scope for column, scope in solution.slots if column in group.columns}:
+        weights = np.array([float(one in group.columns and there == scope) for one, there in solution.slots])
+        variance = float(weights @ solution.covariance @ weights)
+        if not float(weights @ solution.values) >= -_BOUND_SDS * math.sqrt(max(variance, 0.0)):
+            return True
+    return False
 
 
 def held_out_gain(solution: Solution, held: Sequence[Sums]) -> float:
