@@ -284,7 +284,7 @@ def test_what_training_leaves_open_is_not_foretold_of_recordings_that_no_fit_saw
     assert after == pytest.approx(touching, rel=0.15)
 
 
-@pytest.mark.parametrize(("level", "names"), [(0.5, {"friction"}), (-0.5, set())])
+@pytest.mark.parametrize(("level", "names"), [(1.0, {"friction"}), (-1.0, set())])
 def test_levels_that_drive_together_are_no_friction(level, names):
     """Two directions that an offset tells apart badly: each is within two deviations of none, their mean is not."""
 
