@@ -284,6 +284,22 @@ def test_what_training_leaves_open_is_not_foretold_of_recordings_that_no_fit_saw
     assert after == pytest.approx(touching, rel=0.15)
 
 
+@pytest.mark.parametrize(
+    ("shown_in", "size", "names"),
+    [({2}, 0.2, set()), ({0, 2}, 0.2, {"clock"}), ({2}, 0.5, {"clock"})],
+)
+def test_what_training_does_not_show_has_to_be_more_than_what_laws_are_inexact_by(shown_in, size, names):
+    """Beside laws of 1.3 million squares that are known at their size: 160 squares of one recording, or 1000."""
+
+    def draw(run, random):
+        seen = (1.0 if run in shown_in else 1e-3) * random.standard_normal(4000)
+        return [random.standard_normal(4000) + size * seen, seen]
+
+    judge = _table_judge(draw, [Group(("clock", "macro_sensor"), (1,))], training=2)
+    judge.at_size = 1.3e6
+    assert {group.key[0] for group in judge.select()} == names
+
+
 @pytest.mark.parametrize(("level", "names"), [(1.0, {"friction"}), (-1.0, set())])
 def test_levels_that_drive_together_are_no_friction(level, names):
     """Two directions that an offset tells apart badly: each is within two deviations of none, their mean is not."""
