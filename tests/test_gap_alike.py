@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from stagectl.gap import balance, looks
+from stagectl.gap.aliases import aliases_of
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Serial
+from stagectl.gap.judge import ALIAS_SHARE, EXACT_RATIO, LEFT_SDS, Judge
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group
-from stagectl.gap.selection import ALIAS_SHARE, EXACT_RATIO, LEFT_SDS, Judge
+from stagectl.gap.selection import select
 from stagectl.gap.settling import Left
 from tests.driven_axis import AXIS, STEPS, H, axis_under
 
@@ -62,7 +64,7 @@ def _dahl_loses(search: Competition) -> tuple[float, float]:
 def test_a_cable_is_found_wherever_its_anchor_is(anchor_m):
     """From the middle of the travel alone, one whose anchor lay beside it was the offset that it mostly is."""
     search = _search(_pulled_by(60.0, anchor_m))
-    (found,) = search.judge.select()
+    (found,) = select(search.judge)
     term = search.term(found)
     assert term.name == "cable_spring"
     assert term.shape["anchor_m"] == pytest.approx(anchor_m, rel=0.02)
@@ -72,22 +74,22 @@ def test_an_offset_and_a_spring_are_one_cable():
     """As they start from a look before: beside either of them a cable says what the other says, with a number more."""
     search = _search(_pulled_by(60.0, 0.25))
     start = [_of_library(search, "offset"), _of_library(search, "linear_stiffness")]
-    assert [group.key[0] for group in search.judge.select(start)] == ["cable_spring"]
+    assert [group.key[0] for group in select(search.judge, start)] == ["cable_spring"]
 
 
 def test_a_spring_about_zero_is_no_cable():
     """A cable gains what noise does more: by that, and 0.002 % of what both gain, they are the same."""
     search = _search(_pulled_by(60.0, 0.0))
-    assert [group.key[0] for group in search.judge.select()] == ["linear_stiffness"]
+    assert [group.key[0] for group in select(search.judge)] == ["linear_stiffness"]
 
 
 def test_an_offset_is_no_cable_from_ten_metres_away():
     """A constant force, but for a hundredth: a set with a cable in it asks for a move that could split nothing."""
     search = _search(lambda: lambda command_n, x, v: command_n - 3.0)
-    (found,) = search.judge.select()
+    (found,) = select(search.judge)
     assert found.key[0] == "offset"
     assert "cable_spring" in {group.key[0] for group in search.judge.rivals([])}
-    assert [key[0] for key, _ in search.judge.aliases([found], found)] == ["gravity_tilt"]
+    assert [key[0] for key, _ in aliases_of(search.judge, [found], found)] == ["gravity_tilt"]
 
 
 def _rubbed(level_n: float) -> Callable[[], Made]:
@@ -102,7 +104,7 @@ def test_frictions_leave_what_smooth_laws_do(made_n):
     """
     search = _search(made_n)
     judge = search.judge
-    (found,) = judge.select()
+    (found,) = select(judge)
     gained = judge.gain([found]) - judge.gain([])
     assert judge._inexact([found], _of_library(search, "cubic_stiffness")) < 0.1 * EXACT_RATIO * gained
     assert judge._inexact([found], _of_library(search, "position_dependent_friction")) > 0.9 * EXACT_RATIO * gained
@@ -131,7 +133,7 @@ def test_what_explains_a_small_part_of_what_is_left_is_no_name(made_n, stays):
     judge = search.judge
     friction = next(g for g in judge.rivals([]) if g.key[0] == "sublinear_viscous_friction")
     (ripple,) = (group for group in judge.rivals([friction]) if group.key[0] == "current_ripple")
-    assert judge.gain([friction, ripple]) - judge.gain([friction]) > 2.0 * judge._threshold_of([friction], ripple)
+    assert judge.gain([friction, ripple]) - judge.gain([friction]) > 2.0 * judge.threshold_of([friction], ripple)
     judge.curves = []  # a table over position finds some of the sweep, too
     assert judge._is_exact_with([friction], ripple) == stays
 
@@ -139,7 +141,7 @@ def test_what_explains_a_small_part_of_what_is_left_is_no_name(made_n, stays):
 def test_dahls_law_is_found_where_lugres_gains_what_noise_does():
     """Of bristles that hold no more at rest it has three numbers for nothing."""
     search = _search(_bristled(2.0, 1.0, 0.0))
-    (found,) = search.judge.select()
+    (found,) = select(search.judge)
     assert found.key[0] == "dahl_friction"
     assert _dahl_loses(search)[1] < 0.2 * EXACT_RATIO
 
@@ -147,7 +149,7 @@ def test_dahls_law_is_found_where_lugres_gains_what_noise_does():
 def test_what_leaves_no_curve_is_told_from_a_simpler_law_by_less_than_inexact_laws_are():
     """A rise of 0.14 N is 0.08 % of what the bristles gain, and less than noise may hide of what is left."""
     search = _search(_bristled(0.35, 1.4, 3e-4))
-    (found,) = search.judge.select()
+    (found,) = select(search.judge)
     assert found.key[0] == "lugre_friction"
     less, share = _dahl_loses(search)
     assert EXACT_RATIO < share < ALIAS_SHARE
@@ -157,7 +159,7 @@ def test_what_leaves_no_curve_is_told_from_a_simpler_law_by_less_than_inexact_la
 def test_no_law_is_inexact_by_more_than_all_that_is_left():
     """Bristles that left nothing gained 4700 squares, 0.04 %, more than Dahl's, and were a level beside Dahl's."""
     search = _search(_bristled(2.0, 1.1, 3e-4))
-    (found,) = search.judge.select()
+    (found,) = select(search.judge)
     assert found.key[0] == "lugre_friction"
     less, share = _dahl_loses(search)
     assert share < EXACT_RATIO
@@ -171,7 +173,7 @@ def test_a_level_and_a_rise_between_two_speeds_of_the_grid_are_no_bristles():
         return command_n - 2.0 * (1.0 + 0.6 * np.exp(-((v / 5.5e-3) ** 2))) * np.sign(v)
 
     search = _search(lambda: rubbed_n)
-    found = {group.key[0]: search.term(group).shape for group in search.judge.select()}
+    found = {group.key[0]: search.term(group).shape for group in select(search.judge)}
     assert found.keys() == {"coulomb_friction", "stribeck_friction"}
     assert found["stribeck_friction"]["stribeck_m_per_s"] == pytest.approx(5.5e-3, rel=0.02)
 
@@ -180,10 +182,10 @@ def test_a_level_and_a_rise_between_two_speeds_of_the_grid_are_no_bristles():
 def test_what_leaves_less_at_its_size_takes_a_place_where_it_would_have_stayed(stays, name, monkeypatch):
     """A rise that a friction was inexact by took the place of a lag: 400 squares for 240, and no name by itself."""
     search = _search(_pulled_by(60.0, 0.0))
-    stood = Judge._stays
+    stood = Judge.stays
     monkeypatch.setattr(
         Judge,
-        "_stays",
+        "stays",
         lambda judge, chosen, group: stood(judge, chosen, group) and (stays or group.key[0] == "sensor_lag"),
     )
     lag = next(group for group in search.judge.library if group.key == ("sensor_lag", "macro_sensor"))
@@ -200,9 +202,9 @@ def test_what_leaves_less_at_its_size_takes_a_place_where_it_would_have_stayed(s
 def test_no_name_is_dropped_where_forms_are_told_apart_beside_all_names(monkeypatch):
     """A spring left less at its size than a wear beside which it stood, and a delay and a lag were compared without."""
     search = _search(_pulled_by(60.0, 0.0))
-    stood = Judge._stays
+    stood = Judge.stays
     monkeypatch.setattr(
-        Judge, "_stays", lambda judge, chosen, group: group.key[0] == "sensor_lag" or stood(judge, chosen, group)
+        Judge, "stays", lambda judge, chosen, group: group.key[0] == "sensor_lag" or stood(judge, chosen, group)
     )
     lag = next(group for group in search.judge.library if group.key == ("sensor_lag", "macro_sensor"))
     spring = _of_library(search, "linear_stiffness")

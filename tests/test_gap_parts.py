@@ -11,6 +11,7 @@ from scipy import signal
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RecordError, RequestError
 from stagectl.gap import balance, hypotheses, innovations
+from stagectl.gap.aliases import aliases_of
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.competition import Competition
@@ -19,11 +20,12 @@ from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.forces import Forces
 from stagectl.gap.hypotheses import widest_amplitudes
 from stagectl.gap.innovations import moments
+from stagectl.gap.judge import FLOOR_VARIANCE, Judge
 from stagectl.gap.left_over import finer_curve, one_curve_for_many
 from stagectl.gap.log import Log, log_of_rows
 from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
-from stagectl.gap.selection import FLOOR_VARIANCE, Judge
+from stagectl.gap.selection import lacks_a_name, select
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
 
@@ -138,10 +140,10 @@ def _judge(planted: float) -> Judge:
 
 def test_the_planted_term_is_found_and_its_twin_is_an_alias():
     judge = _judge(0.3)
-    chosen = judge.select()
+    chosen = select(judge)
     assert len(chosen) == 1
     assert chosen[0].key[0] in ("term 3", "term 4")
-    names = {chosen[0].key[0], *(key[0] for key, _ in judge.aliases(chosen, chosen[0]))}
+    names = {chosen[0].key[0], *(key[0] for key, _ in aliases_of(judge, chosen, chosen[0]))}
     assert "term 3" in names
     assert solve([*judge.base, chosen[0]], judge.training).of(chosen[0])[0][0] == pytest.approx(0.3, abs=0.03)
 
@@ -151,7 +153,7 @@ def test_beside_what_is_taken_at_its_size_a_name_gains_more_than_that_is_inexact
     """The planted term gains 1100 squares; a clock of the other sensor that was none gained 67 beside 367 million."""
     judge = _judge(0.3)
     judge.at_size = at_size
-    assert len(judge.select()) == names_count
+    assert len(select(judge)) == names_count
 
 
 @pytest.mark.parametrize(("wider", "is_alias"), [("cable_spring", True), ("stribeck_friction", False)])
@@ -161,7 +163,7 @@ def test_a_law_about_a_place_is_no_wider_than_one_about_zero(wider, is_alias):
     place = "macro_force"
     spring, other = Group(("linear_stiffness", place), (3,)), Group((wider, place), (4,), searched=1)
     judge.library[1:3] = spring, other
-    assert ((wider, place) in [key for key, _ in judge.aliases([spring], spring)]) is is_alias
+    assert ((wider, place) in [key for key, _ in aliases_of(judge, [spring], spring)]) is is_alias
 
 
 def test_names_are_as_far_apart_as_what_they_say():
@@ -183,7 +185,7 @@ def test_two_laws_are_one_set_where_recordings_lie_between_them(share, is_alias)
 
     one, other = (Group((name, "macro_sensor"), (column,)) for name, column in (("one", 1), ("other", 2)))
     judge = _table_judge(draw, [one, other])
-    assert [key[0] for key, _ in judge.aliases([one], one)] == ["other"] * is_alias
+    assert [key[0] for key, _ in aliases_of(judge, [one], one)] == ["other"] * is_alias
 
 
 def test_a_belief_that_fitting_made_worse_is_what_the_gap_is_counted_from():
@@ -239,7 +241,7 @@ def test_what_training_leaves_open_does_not_speak_against_the_truth():
     )
     judge = _table_judge(draw, [one, other])
     assert judge.foretold([one, other]) > judge.foretold([one]) + 50.0
-    assert {group.key[0] for group in judge.select()} == {"one", "other"}
+    assert {group.key[0] for group in select(judge)} == {"one", "other"}
 
 
 @pytest.mark.parametrize(("touching", "folds"), [({2}, 2), ({1, 2}, 3), (set(), 3)])
@@ -297,7 +299,7 @@ def test_what_training_does_not_show_has_to_be_more_than_what_laws_are_inexact_b
 
     judge = _table_judge(draw, [Group(("clock", "macro_sensor"), (1,))], training=2)
     judge.at_size = 1.3e6
-    assert {group.key[0] for group in judge.select()} == names
+    assert {group.key[0] for group in select(judge)} == names
 
 
 @pytest.mark.parametrize(("level", "names"), [(1.0, {"friction"}), (-1.0, set())])
@@ -315,7 +317,7 @@ def test_levels_that_drive_together_are_no_friction(level, names):
     values, sds = solution.of(levels)
     assert np.all(np.abs(values - level) < 3.0 * sds)
     assert np.all(sds > 0.5 * abs(level))
-    assert {group.key[0] for group in judge.select()} == names
+    assert {group.key[0] for group in select(judge)} == names
 
 
 def test_two_that_only_stand_together_are_found():
@@ -329,8 +331,8 @@ def test_two_that_only_stand_together_are_found():
 
     pair = [Group((name, "macro_force"), (column,)) for name, column in (("one", 1), ("other", 2))]
     judge = _table_judge(draw, pair, training=4, runs=4)
-    assert not any(judge._stays([], group) for group in pair)
-    assert {group.key[0] for group in judge.select()} == {"one", "other"}
+    assert not any(judge.stays([], group) for group in pair)
+    assert {group.key[0] for group in select(judge)} == {"one", "other"}
 
 
 @pytest.mark.parametrize(("is_left", "count"), [(False, 2), (True, 1)])
@@ -342,7 +344,7 @@ def test_a_small_name_beside_a_large_one_stays_where_no_curve_finds_anything(is_
 
     large, small = Group(("large", "macro_force"), (1,)), Group(("small", "macro_force"), (2,))
     judge = _table_judge(draw, [large, small], curves=[Group(("curve", "macro_force"), (3,))])
-    assert len(judge.select()) == count
+    assert len(select(judge)) == count
 
 
 @pytest.mark.parametrize(("place", "count"), [("macro_force", 1), ("micro_force", 2)])
@@ -353,7 +355,7 @@ def test_a_second_friction_of_a_body_takes_away_a_curve_or_is_what_the_first_is_
 
     large, small = Group(("coulomb_friction", "macro_force"), (1,)), Group(("stribeck_friction", place), (2,))
     judge = _table_judge(draw, [large, small], curves=[Group(("curve", "macro_force"), (3,))])
-    assert len(judge.select()) == count
+    assert len(select(judge)) == count
 
 
 def test_what_rises_on_a_level_is_reshaped_with_the_level():
@@ -369,8 +371,8 @@ def test_what_rises_on_a_level_is_reshaped_with_the_level():
     judge = _table_judge(draw, [compromise, level], curves=[curve])
     judge.refine = lambda beside, groups: [rise if level in beside and g is compromise else g for g in groups]
     assert judge.gain([compromise, level]) - judge.gain([compromise]) > 35.0
-    assert not judge._stays([compromise], level)
-    assert judge.select() == [rise, level]
+    assert not judge.stays([compromise], level)
+    assert select(judge) == [rise, level]
 
 
 @pytest.mark.parametrize(
@@ -387,7 +389,7 @@ def test_bristles_that_slip_by_nothing_are_a_level_and_a_rise(slip, names):
     place = "macro_force"
     level, rise = Group(("coulomb_friction", place), (1,)), Group(("stribeck_friction", place), (2,), searched=1)
     judge = _table_judge(draw, [level, rise, Group(("lugre_friction", place), (3,), searched=3)])
-    assert {group.key[0] for group in judge.select()} == names
+    assert {group.key[0] for group in select(judge)} == names
 
 
 def test_parts_of_bristles_stand_where_the_bristles_stood():
@@ -401,7 +403,7 @@ def test_parts_of_bristles_stand_where_the_bristles_stood():
     place = "macro_force"
     level, rise = Group(("coulomb_friction", place), (1,)), Group(("stribeck_friction", place), (2,), searched=1)
     bristles, later = Group(("lugre_friction", place), (3,), searched=3), Group(("offset", "micro_force"), (4,))
-    chosen = _table_judge(draw, [level, rise, bristles, later]).select()
+    chosen = select(_table_judge(draw, [level, rise, bristles, later]))
     assert len(chosen) == 3
     assert chosen[-1] is later
 
@@ -414,7 +416,7 @@ def test_a_law_that_loses_by_more_than_is_left_is_none_that_inexact_laws_excuse(
         return [random.standard_normal(4000) + 30.0 * common + 0.7 * apart, 30.0 * common + apart, 30.0 * common]
 
     one, other = (Group((name, "macro_sensor"), (column,)) for name, column in (("one", 1), ("other", 2)))
-    assert _table_judge(draw, [one, other]).aliases([one], one) == []
+    assert aliases_of(_table_judge(draw, [one, other]), [one], one) == []
 
 
 @pytest.mark.parametrize(("names_count", "missing", "is_one"), [(3, 0.0, True), (2, 0.0, False), (3, 0.1, False)])
@@ -444,8 +446,8 @@ def test_where_a_curve_explains_more_than_a_fourth_name_there_is_none(beside_cou
     names = [Group((f"name {k}", f"place {k}"), (1 + k,)) for k in range(4)]
     curve = Group(("curve over position_m", "macro_force"), (5,))
     judge = _table_judge(draw, names, curves=[curve])
-    assert judge.lacks_a_name([*names[3 - beside_count : 3]]) is is_missing
-    assert {group.key for group in judge.select()} == {group.key for group in names[: 3 if fourth < 0.4 else 4]}
+    assert lacks_a_name(judge, [*names[3 - beside_count : 3]]) is is_missing
+    assert {group.key for group in select(judge)} == {group.key for group in names[: 3 if fourth < 0.4 else 4]}
 
 
 def test_of_two_places_that_a_few_sizes_were_tried_at_the_better_one_is_taken():
@@ -462,7 +464,7 @@ def test_of_two_places_that_a_few_sizes_were_tried_at_the_better_one_is_taken():
 
 
 def test_on_noise_nothing_is_named():
-    assert _judge(0.0).select() == []
+    assert select(_judge(0.0)) == []
 
 
 def test_a_sum_of_amplitudes_is_as_uncertain_as_both_together():
@@ -704,7 +706,7 @@ def test_a_bound_is_as_uncertain_as_the_masses_that_amplitudes_are_told_of(scale
     whole = Group(("micro_reaction", "macro_force"), (1,), prior_sds=(1.0,), bounds=((0.0, 1.0),))
     judge = _table_judge(draw, [whole])
     judge.scale_sd_ratio = scale_sd_ratio
-    assert [group.key for group in judge.select()] == [whole.key] * is_allowed
+    assert [group.key for group in select(judge)] == [whole.key] * is_allowed
 
 
 @pytest.mark.parametrize(("shapes", "is_alias"), [((2,), False), ((2, 3), True)])
@@ -720,4 +722,4 @@ def test_the_same_law_elsewhere_is_an_alias_at_any_of_its_shapes(shapes, is_alia
     judge = _table_judge(draw, [named, elsewhere])
     forms = [dataclasses.replace(elsewhere, columns=(column,)) for column in shapes]
     judge.brought_near = lambda other, group: forms if other.key == elsewhere.key else [other]
-    assert [key for key, _ in judge.aliases([named], named)] == [elsewhere.key] * is_alias
+    assert [key for key, _ in aliases_of(judge, [named], named)] == [elsewhere.key] * is_alias

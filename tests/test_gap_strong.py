@@ -22,6 +22,7 @@ from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group, solve
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner, power_of_size
+from stagectl.gap.selection import select
 from stagectl.gap.settling import _resized
 from tests.driven_axis import AXIS, MASS, NOISE_M, STEPS, H, axis_under
 
@@ -118,7 +119,7 @@ def test_a_strong_effect_is_searched_until_nothing_is_left_and_does_not_raise_th
     recordings, noise = _recordings(), slow_noise(AXIS, _recordings()[0])
     first = Competition(recordings, 2, nulls_count=20, noise=noise)
     first.judge.calibrate()
-    chosen = first.judge.select(most=1)
+    chosen = select(first.judge, most=1)
     assert [group.key for group in chosen] == [("current_ripple", "macro_actuator")]
     term = first.term(chosen[0])
     assert term.shape["pitch_m"] == pytest.approx(PITCH_M, rel=1e-5)
@@ -133,7 +134,7 @@ def test_no_size_is_stated_better_than_laws_are_exact():
     recordings, noise = _recordings(), slow_noise(AXIS, _recordings()[0])
     search = Competition(recordings, 2, noise=noise)
     search.judge.threshold = 30.0
-    chosen = search.judge.select(most=1)
+    chosen = select(search.judge, most=1)
     assert min(search.judge.source.sums[0].gram[c, c] for c in chosen[0].columns) > 1e6
     (found,) = measured(
         search, chosen, solve([*search.judge.base, *chosen], search.evidence.sums), all_named(search, chosen)
@@ -152,11 +153,11 @@ def test_a_drag_is_named_beside_a_ripple_of_ten_thousand_times_its_squares():
     noise = slow_noise(AXIS, recordings[0])
     first = Competition(recordings, 3, nulls_count=20, noise=noise)
     first.judge.calibrate()
-    chosen = first.judge.select(most=1)
+    chosen = select(first.judge, most=1)
     assert [group.key for group in chosen] == [("current_ripple", "macro_actuator")]
     search = Competition(recordings, 3, noise=noise, kept=[first.term(chosen[0])])
     search.judge.threshold = first.judge.threshold
-    found = search.judge.select(search.judge.reshaped(search.kept))
+    found = select(search.judge, search.judge.reshaped(search.kept))
     assert {group.key for group in found} == {("current_ripple", "macro_actuator"), ("quadratic_drag", "macro_force")}
     judge, (ripple, drag) = search.judge, sorted(found, key=lambda group: group.key)
     assert judge.gain(found) - judge.gain([drag]) > 1e4 * (judge.gain(found) - judge.gain([ripple]))

@@ -14,11 +14,11 @@ from stagectl.gap.alias_sets import ENCODER, GAP_SENSOR, alias_sets
 from stagectl.gap.balance import recording_of, set_noise
 from stagectl.gap.believed import Believed, believed_of_profile
 from stagectl.gap.identifiability import AliasSet, not_separable, separations, separations_of, splitting
+from stagectl.gap.judge import ALIAS_GAIN
 from stagectl.gap.log import Log, read_log
 from stagectl.gap.moves import Move, library, room_of
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.planned import planned_log
-from stagectl.gap.selection import ALIAS_GAIN
 from stagectl.profile import load_profile
 from stagectl.value_seam_run import simulate
 

@@ -180,5 +180,5 @@ def test_a_result_of_the_gap_depends_on_what_it_imports_and_on_nothing_else():
     found = set(gap_sources())
     assert imported <= found  # and what is imported within functions
     names = {str(path.relative_to(ROOT)) for path in found}
-    assert {"stagectl/gap/selection.py", "stagectl/effects/friction.py", "tests/blind/laws.py"} <= names
+    assert {"stagectl/gap/judge.py", "stagectl/effects/friction.py", "tests/blind/laws.py"} <= names
     assert not any(name.startswith(("stagectl/service", "tests/faults", "bench/service")) for name in names)

@@ -12,6 +12,7 @@ from stagectl.gap.forces import Forces, scaled_forces
 from stagectl.gap.grids import free_shapes, grids_for
 from stagectl.gap.hypotheses import DEVIATION_SD, Term, widest_amplitudes
 from stagectl.gap.innovations import Noise
+from stagectl.gap.judge import Judge
 from stagectl.gap.noise import Explained
 from stagectl.gap.normal_equations import Group, Sums, solve
 from stagectl.gap.operating_point import Moved
@@ -26,7 +27,6 @@ from stagectl.gap.refinement import (
     searched_count,
     with_shape,
 )
-from stagectl.gap.selection import Judge
 
 _EXCITED_GAIN = 1e-6
 _SEED = 0  # of the noise that pitches stand out of

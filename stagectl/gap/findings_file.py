@@ -30,7 +30,8 @@ def read_findings(path: Path) -> Findings:
         if content.pop("format", None) != _FORMAT:
             raise RecordError(f"{path}: findings of another version; run `stagectl gap` again")
         content["named"] = tuple(
-            Named(**{**row, "aliases": tuple(tuple(alias) for alias in row["aliases"])}) for row in content["named"]
+            Named(**{**row, **{name: tuple(map(tuple, row.get(name, ()))) for name in ("aliases", "correlations")}})
+            for row in content["named"]
         )
         content["parameter_errors"] = tuple(
             ParameterError(**{**row, "aliases": tuple(row["aliases"])}) for row in content["parameter_errors"]

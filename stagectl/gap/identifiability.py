@@ -21,13 +21,13 @@ from stagectl.gap.alias_sets import SIGNALS, AliasSet, alias_sets
 from stagectl.gap.believed import Believed
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.hypotheses import Term
+from stagectl.gap.judge import ALIAS_GAIN
 from stagectl.gap.log import Log
 from stagectl.gap.moves import Move
 from stagectl.gap.noise import noise_of, slow_noise
 from stagectl.gap.normal_equations import Group, Sums, active_slots, normal_of
 from stagectl.gap.planned import planned_log
 from stagectl.gap.recording import Recording
-from stagectl.gap.selection import ALIAS_GAIN
 
 _JITTER = 1e-10
 _HIGH_SHARE = 0.3  # of the sample rate

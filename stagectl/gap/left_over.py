@@ -7,8 +7,8 @@ import numpy as np
 from stagectl.effects import CATALOGUE
 from stagectl.gap.competition import Competition
 from stagectl.gap.curves import unit_of
+from stagectl.gap.judge import ALIAS_GAIN, CURVE_GAIN, MATERIAL_RATIO, Judge
 from stagectl.gap.normal_equations import Group, solve
-from stagectl.gap.selection import ALIAS_GAIN, CURVE_GAIN, MATERIAL_RATIO, Judge
 
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03

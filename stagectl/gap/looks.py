@@ -16,6 +16,7 @@ from stagectl.gap.crew import Crew
 from stagectl.gap.curvature import at_best_shapes
 from stagectl.gap.findings import Named
 from stagectl.gap.innovations import Noise
+from stagectl.gap.judge import ALIAS_GAIN, LEFT_SDS, Judge
 from stagectl.gap.known_motion import moved_under
 from stagectl.gap.left_over import excess, unknown_rest
 from stagectl.gap.naming import all_named, measured
@@ -23,7 +24,7 @@ from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
-from stagectl.gap.selection import ALIAS_GAIN, LEFT_SDS, Judge
+from stagectl.gap.selection import lacks_a_name, select
 from stagectl.gap.settling import (
     Left,
     belief_under,
@@ -88,7 +89,7 @@ def looked_closely(
     unsettled: the recordings before the joint's edges were put where they are.
     """
     case = _Case(first, unsettled, without, crew)
-    found = first.judge.select(until=lambda group: moves_joint(first, group))
+    found = select(first.judge, until=lambda group: moves_joint(first, group))
     look = _told_anew(Look(first, found, all_named(first, found)), unsettled, crew)
     course = _Course(look, look, _keys(look), first.noise)
     for _ in range(_CLOSER_LOOKS):
@@ -121,7 +122,7 @@ def _has_reached_floor(plain: Look, look: Look) -> bool:
 def _taken(case: _Case, course: _Course) -> tuple[Look, tuple[Named, ...]]:
     """Return the next look, and those of its names that are part of the operating point."""
     search = _under(course.known, course.moved, case.first, case.unsettled, case.without, course.refused, case.crew)
-    chosen = search.judge.select(search.judge.reshaped(search.kept), until=lambda group: group.is_slope)
+    chosen = select(search.judge, search.judge.reshaped(search.kept), until=lambda group: group.is_slope)
     solution = solve([*search.judge.base, *chosen], search.evidence.sums)
     at_size = remeasured(search, solution, course.known.named, search.moved) if search.moved else ()
     return Look(search, chosen, at_size + all_named(search, chosen)), at_size
@@ -131,7 +132,7 @@ def _is_unknown(case: _Case, look: Look) -> bool:
     """Tell whether what is left lacks a name, with the joint in its place."""
     search = look.search
     return (
-        search.judge.lacks_a_name(look.chosen)
+        lacks_a_name(search.judge, look.chosen)
         and not any(moves_joint(search, group) for group in look.chosen)
         and unknown_rest(search, look.chosen, excess(belief_under(case.first, search, case.crew), [])) is not None
     )

@@ -9,16 +9,17 @@ import numpy as np
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import hypotheses
+from stagectl.gap.aliases import aliases_of
 from stagectl.gap.believed import Believed
 from stagectl.gap.competition import Competition
 from stagectl.gap.findings import Named, ParameterError, title_of
 from stagectl.gap.hypotheses import Term
+from stagectl.gap.judge import CONTRADICTION
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.quantities import along_motion, in_order, quantities
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import power_of_size
 from stagectl.gap.scatter import INEXACT_RATIO
-from stagectl.gap.selection import CONTRADICTION
 from stagectl.gap.settling import settled_by
 
 
@@ -39,7 +40,7 @@ def all_named(search: Competition, chosen: list[Group]) -> tuple[Named, ...]:
                 **_sized(search, solution, group),
                 gain=whole[0] - rest[0],
                 held_out_gain=whole[1] - rest[1],
-                aliases=tuple((*key, margin) for key, margin in judge.aliases(chosen, group)),
+                aliases=tuple((*key, margin) for key, margin in aliases_of(judge, chosen, group)),
             )
         )
     return tuple(found)
@@ -204,7 +205,7 @@ def parameter_errors(search: Competition, chosen: list[Group], solution: Solutio
         if term.acts_on == "parameter":
             values, sds = solution.of(group)
             own = stated[hypotheses.parts_of(term.name)[0]]
-            aliases = tuple(key[0] for key, _ in search.judge.aliases(chosen, group) if key[1] == "parameter")
+            aliases = tuple(key[0] for key, _ in aliases_of(search.judge, chosen, group) if key[1] == "parameter")
             found.append(ParameterError(term.name, float(values[0]), float(sds[0]), own, aliases))
     return tuple(found)
 

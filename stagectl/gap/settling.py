@@ -21,12 +21,12 @@ from stagectl.gap.evidence import Evidence, Scales
 from stagectl.gap.findings import Named
 from stagectl.gap.hypotheses import DEVIATION_SD, Term, widest_amplitudes
 from stagectl.gap.innovations import Noise
+from stagectl.gap.judge import Judge
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.operating_point import Moved, operating_point, with_joint_changed
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import LATCH_SDS, power_of_size, whole_of
 from stagectl.gap.scatter import INEXACT_RATIO
-from stagectl.gap.selection import Judge
 
 _EDGE_PASSES = 3
 _PASSES_BESIDE = 6  # a knee and an edge pull at each other
