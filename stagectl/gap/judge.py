@@ -283,7 +283,7 @@ class Judge:
         What one recording alone shows, nothing but its size tells from what laws are inexact by there: beside a clock
         of 1.3 million squares, one of the other sensor gained 2 in four recordings and 249 in the one kept apart.
         """
-        if not self.held or group.is_slope:
+        if not self.held:
             return True
         now, with_it = (solve([*self.base, *some], self.training).gain for some in (chosen, [*chosen, group]))
         return with_it - now > ALIAS_GAIN

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap.competition import Competition
@@ -19,10 +20,10 @@ _EXACT_CURVE_SHARE = 5e-4
 to 55 million squares curves found 122 and less, and 2100 and less were left, two and a half deviations of the floor. A
 Dahl friction in the place of bristles had left 34 000 of 2.2 million, which was no rest by the others."""
 
-_FINER_GAIN = 2.0
-"""Of what the best of the library gains on noise, what a finer curve finds at least, beside what its numbers gain on
-noise: beside right names of 5800 squares to 55 million they found 40 and less of what is late, 122 of what turns round
-where 55 million were explained; beside five names in the place of a clock of 6000 squares 63."""
+_FINER_TAIL = 1e-6
+"""How seldom a finer curve finds as much on noise as makes it a rest. Beside right names they found no more than that
+but where millions of squares were explained, and there 2e-5 of them; beside five names in the place of a clock of 6000
+squares, 46 by what is late, where noise gives 40 once in a million times."""
 
 _CROWD_COUNT = 3
 """So many names on one body that a single curve does as well as are one effect that has no name: a spring with a dead
@@ -66,7 +67,7 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
     floor = _LEFT_SDS * noise + left_share * max(first, 0.0)
     material = curve_share * max(first, 0.0)
     if not left > floor and not gained > max(CURVE_GAIN * judge.threshold, material):
-        finer = finer_curve(search, chosen, max(_FINER_GAIN * judge.threshold, material))
+        finer = finer_curve(search, chosen, material)
         if finer is None:
             return None
         if finer.key not in {curve.key for curve in search.curves}:  # of place there is a coarse one, as tables are
@@ -83,8 +84,8 @@ def _are_exact(search: Competition, chosen: list[Group]) -> bool:
     return not search.judge.is_rough and not any(name in CATALOGUE and CATALOGUE[name].origin for name in names)
 
 
-def finer_curve(search: Competition, chosen: list[Group], least: float) -> Group | None:
-    """Return a finer curve that finds what laws leave, beyond what its numbers gain on noise; None where there is none.
+def finer_curve(search: Competition, chosen: list[Group], material: float) -> Group | None:
+    """Return a finer curve that finds more than on noise, and than is material, of what laws leave; None where none does.
 
     A spring with a dead zone is a cable and two ripples as long as the travel, but for its two kinks: 5800 squares of
     388 000 were left, of which twelve knots found 350 and forty-eight 5000. A friction that grows with the time since
@@ -95,7 +96,7 @@ def finer_curve(search: Competition, chosen: list[Group], least: float) -> Group
     for curve in search.finer_curves():
         gained = search.judge.gain([*chosen, curve]) - now
         search.judge.trace.append(f"{search.term(curve).name}, finer, on {curve.key[1]} finds {gained:.0f}")
-        if gained > least + len(curve.columns):
+        if gained > max(material, chi2.isf(_FINER_TAIL, len(curve.columns))):
             return curve
     return None
 
