@@ -85,7 +85,7 @@ def _are_exact(search: Competition, chosen: list[Group]) -> bool:
 
 
 def finer_curve(search: Competition, chosen: list[Group], material: float) -> Group | None:
-    """Return a finer curve that finds more than on noise, and than is material, of what laws leave; None where none does.
+    """Return a finer curve that finds more of what is left than on noise, and than is material; None where none does.
 
     A spring with a dead zone is a cable and two ripples as long as the travel, but for its two kinks: 5800 squares of
     388 000 were left, of which twelve knots found 350 and forty-eight 5000. A friction that grows with the time since
