@@ -4,7 +4,7 @@ Some compete from the start, over place, velocity, time and where the joint is. 
 names leave. Pure.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -174,9 +174,15 @@ def _hats_closing(knots: np.ndarray, r: Recording) -> list[Forces]:
     return [between(r, np.where(inside, r.side * weight, 0.0)) for weight in _weights(rate, knots)]
 
 
-def _weights(value: np.ndarray, knots: np.ndarray) -> list[np.ndarray]:
-    return [np.interp(value, knots, np.eye(knots.size)[k]) for k in range(knots.size)]
+def _weights(value: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """Return each knot's share in a value between two of them, shape (knots, *value.shape); ends are held."""
+    flat = value.ravel()
+    below = np.clip(np.searchsorted(knots, flat, side="right") - 1, 0, knots.size - 2)
+    share = np.clip((flat - knots[below]) / (knots[below + 1] - knots[below]), 0.0, 1.0)
+    weights, at = np.zeros((knots.size, flat.size)), np.arange(flat.size)
+    weights[below, at], weights[below + 1, at] = 1.0 - share, share
+    return weights.reshape(knots.size, *value.shape)
 
 
-def _on(axis: str, weights: Sequence[np.ndarray]) -> list[Forces]:
+def _on(axis: str, weights: Iterable[np.ndarray]) -> list[Forces]:
     return [Forces(macro_n=weight) if axis == "macro" else Forces(end_n=weight) for weight in weights]
