@@ -14,6 +14,10 @@ from stagectl.gap.normal_equations import Group, solve
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
 _CURVE_SHARE = MATERIAL_RATIO  # more than what an inexact law leaves
+_FINER_SHARE = 2.0 * MATERIAL_RATIO
+"""The same of a finer curve: beside a hill that a user declared, of 945 000 squares, a machine that answers 50 us
+sooner than is believed left 5200 to the curve over the motor's past. Forces without a law left 1.3 and 1.5 %."""
+
 _EXACT_LEFT_SHARE = 0.005
 _EXACT_CURVE_SHARE = 5e-4
 """The same where only laws of the library stand, on a machine without force noise of its own: beside right names of 0.4
@@ -61,13 +65,13 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
         if gain > gained:
             best, gained = curve, gain
     judge.trace.append(f"left over {left:.0f} of {first:.0f}, noise {noise:.0f}, best curve {gained:.0f}")
-    left_share, curve_share = (
-        (_EXACT_LEFT_SHARE, _EXACT_CURVE_SHARE) if _are_exact(search, chosen) else (_LEFT_SHARE, _CURVE_SHARE)
-    )
+    left_share, curve_share, finer_share = _LEFT_SHARE, _CURVE_SHARE, _FINER_SHARE
+    if _are_exact(search, chosen):
+        left_share, curve_share, finer_share = _EXACT_LEFT_SHARE, _EXACT_CURVE_SHARE, _EXACT_CURVE_SHARE
     floor = _LEFT_SDS * noise + left_share * max(first, 0.0)
-    material = curve_share * max(first, 0.0)
-    if not left > floor and not gained > max(CURVE_GAIN * judge.threshold, material):
-        finer = finer_curve(search, chosen, material)
+    least = max(CURVE_GAIN * judge.threshold, curve_share * max(first, 0.0))
+    if not left > floor and not gained > least:
+        finer = finer_curve(search, chosen, finer_share * max(first, 0.0))
         if finer is None:
             return None
         if finer.key not in {curve.key for curve in search.curves}:  # of place there is a coarse one, as tables are
