@@ -27,8 +27,6 @@ CONTAINED_IN: dict[str, tuple[frozenset[str], ...]] = {
 }
 """Laws, and pairs of laws, that hold another as a special case or are the same: naming them isn't wrong."""
 
-Key = tuple[str, str]
-
 
 def without(name: str, acts_on: str) -> frozenset[str]:
     """Return the names of our effects that answer to a law of the truth."""

@@ -86,6 +86,13 @@ def test_viscous_and_coulomb_friction_are_no_drag():
     assert detection.SEPARABLE_D < two < together.distance(drag, [("viscous_friction", "macro_force")])
 
 
+def test_a_law_is_no_mixture_of_two_of_its_speeds(tilted):
+    evidence = detection.Evidence(tilted, tilted.runs).narrowed(detection.SEPARATION_BAND_HZ)
+    for name, columns in (("stribeck_friction", {1}), ("cable_spring", {1, 2})):
+        points = together._points(evidence, name, "macro_force", tilted.effects)
+        assert {len(point.columns) for point in points} == columns
+
+
 def test_a_law_that_the_generator_has_not_is_infinitely_far(tilted):
     assert together.distance(tilted, [("force_over_position", "macro_force")]) == math.inf
 

@@ -81,8 +81,10 @@ def _curve_problem(unknown: Mapping[str, Any]) -> str:
     if strange := [name for name in ("over", "acts_on", "unit", "knots", "values", "sds") if name not in unknown]:
         return f"lacks {strange[0]}"
     lists = [unknown[name] for name in ("knots", "values", "sds")]
+    if not all(isinstance(one, list) and one and _are_numbers(one) for one in lists):
+        return "has no numbers in knots, values and sds"
     count = KNOTS_COUNT if is_tabled(unknown) else len(lists[0])
-    if not all(isinstance(one, list) and len(one) == count and _are_numbers(one) for one in lists):
+    if not all(len(one) == count for one in lists):
         return f"has not {count} numbers in knots, values and sds"
     steps = [after - before for before, after in itertools.pairwise(lists[0])]
     if is_tabled(unknown) and not 0.0 < max(steps) < (1.0 + _EVEN_RATIO) * min(steps):

@@ -71,8 +71,10 @@ def _points(evidence, name, acts_on, hints):
         sizes = [share * middle for share in (detection.SLOPE_SHARE, *detection.SIZE_STARTS)]
         sizes += [-size for size in sizes] if signed else []
         found += [Point([at_size(size)], at_size, size) for size in sizes]
-    if any(p.name in detection.SHAPE_FACTORS and "phase" not in p.spread for p in law.parameters[1:]):
-        pairs = itertools.combinations(found, 2)  # a mixture of any two values of a linear factor is every other one
+    shapes = law.parameters[1:]
+    if shapes and all(p.name in detection.SHAPE_FACTORS and "phase" not in p.spread for p in shapes):
+        # a mixture of two values of a linear factor is every other one; of two pitches or speeds it is none of the law
+        pairs = itertools.combinations(found, 2)
         found += [Point([*one.columns, *other.columns]) for one, other in pairs]
     return found
 
