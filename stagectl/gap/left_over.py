@@ -26,8 +26,8 @@ Dahl friction in the place of bristles had left 34 000 of 2.2 million, which was
 
 _FINER_TAIL = 1e-6
 """How seldom a finer curve finds as much on noise as makes it a rest. Beside the right names of 13 sets none found that
-much but 60 squares (51 is so much) beside 1.4 million, where 700 are material; beside five names in the place of a clock
-of 6000 squares, what is late found 46, where noise gives 40 so seldom."""
+much but 60 squares (51 is so much) beside 1.4 million, where 700 are material; beside five names in the place of a
+clock of 6000 squares, what is late found 46, where noise gives 40 so seldom."""
 
 _CROWD_COUNT = 3
 """So many names on one body that a single curve does as well as are one effect that has no name: a spring with a dead
