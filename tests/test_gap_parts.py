@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from bench.blind_sets import load_set
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RecordError, RequestError
 from stagectl.gap import balance, hypotheses, innovations
@@ -21,13 +22,15 @@ from stagectl.gap.forces import Forces
 from stagectl.gap.hypotheses import widest_amplitudes
 from stagectl.gap.innovations import moments
 from stagectl.gap.judge import FLOOR_VARIANCE, Judge
-from stagectl.gap.left_over import finer_curve, one_curve_for_many
+from stagectl.gap.left_over import excess, finer_curve, one_curve_for_many, unknown_rest
 from stagectl.gap.log import Log, log_of_rows
-from stagectl.gap.noise import noise_of
+from stagectl.gap.looks import Look, _has_reached_floor
+from stagectl.gap.noise import noise_of, slow_noise
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
 from stagectl.gap.selection import lacks_a_name, select
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
+from tests.blind import draw, generate
 
 H, MASS = 1e-3, 40.0
 
@@ -580,6 +583,52 @@ def test_what_twelve_knots_do_not_find_a_finer_curve_does(hidden, over):
     assert max(gained) < LEAST_SQUARES
     found = finer_curve(search, [friction], LEAST_SQUARES)
     assert (found and found.key) == over, search.judge.trace
+
+
+def test_edges_that_wear_are_a_curve_over_time_beside_a_wider_gap(tmp_path):
+    """A joint of which only a width that is wrong was said: 1200 of 128 000 squares were left, and no curve's."""
+    case = generate.draw(3197, "single", 6.0)
+    case.effects = [one.scaled(3.0) for one in case.effects]
+    case.runs = [run for run in draw.simulate(case) if run.recipe == "two_sided_contact"]
+    generate.write(case, tmp_path)
+    blind = load_set(tmp_path)
+    (log,), joint, (hidden,) = blind.logs, blind.believed.joint, case.effects
+    assert joint is not None
+    out_m = 0.5 * hidden.values["rate_m_per_s"] * (log.start_s + np.median(log.times_s))  # as a first look found it
+    joint = dataclasses.replace(joint, left_m=joint.left_m + out_m, right_m=joint.right_m + out_m)
+    recordings = [balance.recording_of(log, dataclasses.replace(blind.believed, joint=joint))]
+    search = Competition(recordings, 1, without=frozenset({"backlash_wear"}), noise=noise_of(recordings))
+    found = finer_curve(search, [], 0.0)
+    assert found is not None
+    assert found.key == ("curve over t_s", "contact_edge")
+    knots_s = np.array([float(name) for name in search.term(found).amplitudes])
+    values_m, sds_m = solve([*search.judge.base, found], search.evidence.sums).of(found)
+    slope_m_per_s, _ = np.polyfit(knots_s, values_m, 1, w=1.0 / sds_m)
+    assert slope_m_per_s == pytest.approx(0.5 * hidden.values["rate_m_per_s"], rel=0.3)  # each edge by half of it
+
+
+def test_a_look_above_more_noise_does_not_say_that_nothing_is_left():
+    """A gap that is 22 um wider had left 16 mN of force noise, above which nothing was left."""
+    recordings = [balance.recording_of(_axis_log("run 1", 1.0, 1, ripple_n=0.05), _believed())]
+    (level,) = slow_noise(_believed(), recordings[0]).values()
+    plain, look = (
+        _look(recordings, {"macro": dataclasses.replace(level, white_force_n=force_n)}) for force_n in (0.256, 0.0)
+    )
+    assert unknown_rest(look.search, look.chosen, excess(look.search.judge, [])) is not None
+    assert unknown_rest(plain.search, plain.chosen, excess(plain.search.judge, [])) is None
+    assert excess(plain.search.judge, plain.chosen) < excess(look.search.judge, look.chosen)
+    assert not _has_reached_floor(plain, look, {"gain": 2000.0, "left": 1200.0})  # a curve's
+    assert _has_reached_floor(plain, look, {"gain": 500.0, "left": 21700.0})  # what a law is inexact by
+
+
+def _look(recordings, noise) -> Look:
+    search = Competition(recordings, 1, noise=noise)
+    search.judge.threshold = 30.0
+    friction = max(
+        (group for group in search.judge.library if group.key == ("coulomb_friction", "macro_force")),
+        key=lambda group: search.judge.gain([group]),
+    )
+    return Look(search, [friction], ())
 
 
 @functools.cache

@@ -170,11 +170,15 @@ def motor_forces(recording: Recording, axis: str, force_n: np.ndarray, current_a
 
 
 def _edges_moved(recording: Recording, effect: Effect, parameters: list[float], whole: bool) -> Forces:
-    """Return what edges further out change: a joint that overlaps less."""
+    """Return what edges further out change, where there are any."""
     joint, end = recording.believed.joint, recording.end
     if joint is None or end is None or recording.side is None:
         return Forces()
-    left_m, right_m = edges_out_m(recording, effect, parameters)
+    return edges_moved(recording, *edges_out_m(recording, effect, parameters), whole)
+
+
+def edges_moved(recording: Recording, left_m: np.ndarray, right_m: np.ndarray, whole: bool) -> Forces:
+    """Return what edges so far out change: a joint that overlaps less. As a slope at where they are, or whole."""
     share = 1.0 if whole else SMALL_M / max(float(np.max(np.abs([left_m, right_m]))), SMALL_M)
     more_n = more_contact_n(recording, 0.0, 0.0, share * left_m, share * right_m)
     return between(recording, more_n / share)

@@ -4,7 +4,7 @@ Takes plain arrays, gives SVG or PNG bytes; knows no file.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -133,12 +133,12 @@ def frequency_figure(residuals: Sequence[Residual], image_format: str = "svg") -
 
 
 def unknown_figure(unknown: dict[str, Any], image_format: str = "svg") -> bytes:
-    """The curve of what repeats and no effect explains, with its 95 % band: a force, a reading, or when one is felt."""
+    """The curve of what repeats and no effect explains, with its 95 % band, whatever it is of."""
     with matplotlib.rc_context(STYLE):
         drawing, (axes,) = panels_of(2.9, 1, 1)
         scale, label = _QUANTITIES.get(unknown["over"], (1.0, unknown["over"]))
         knots = np.asarray(unknown["knots"], float) * scale
-        unit, words, what = _CURVES[unknown["unit"]]
+        unit, words, what = _CURVES[curve_of(unknown)]
         values, half = unit * np.asarray(unknown["values"], float), 1.96 * unit * np.asarray(unknown["sds"], float)
         axes.fill_between(knots, values - half, values + half, color=_AFTER, alpha=0.22, linewidth=0.0)
         axes.plot(knots, values, color=_AFTER, marker="o", markersize=3.5, label=f"{what} that no effect explains")
@@ -148,6 +148,11 @@ def unknown_figure(unknown: dict[str, Any], image_format: str = "svg") -> bytes:
         axes.set_ylabel(words)
         legend(drawing, axes, columns=2)
         return image_of(drawing, image_format)
+
+
+def curve_of(unknown: Mapping[str, Any]) -> str:
+    """Return what a curve is of: its unit, but of an edge, which is in metres as readings are."""
+    return "edge" if unknown["acts_on"] == "contact_edge" else str(unknown["unit"])
 
 
 _QUANTITIES = {
@@ -163,9 +168,10 @@ _QUANTITIES = {
 _CURVES = {
     "N": (1.0, "force (N)", "force"),
     "m": (1e6, "read too much (µm)", "reading"),
+    "edge": (1e6, "edges further out (µm)", "place of the edges"),
     "ratio": (1.0, "felt of the motor's force (ratio)", "answer"),
 }
-"""By a curve's unit: its scale, the label of its axis, what it is."""
+"""By what a curve is of: its scale, the label of its axis, what it is."""
 
 
 def _force_rows(residuals: Sequence[Residual]) -> list[dict[str, Any]]:

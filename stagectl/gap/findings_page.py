@@ -282,12 +282,12 @@ def _figures(findings: Findings, residuals: Sequence[Residual]) -> list[Figure]:
     ]
     if findings.unknown is not None and "knots" in findings.unknown:
         where = f"over {findings.unknown['over']} at {findings.unknown['acts_on']}"
+        shown = _CURVES[findings_figures.curve_of(findings.unknown)]
         made.append(
             Figure(
                 "What no effect explains",
                 findings_figures.unknown_figure(findings.unknown),
-                f"{_CURVES[findings.unknown['unit']]}, {where}, with its 95 % band. It has no name; a table of it "
-                "never counts as one.",
+                f"{shown}, {where}, with its 95 % band. It has no name; a table of it never counts as one.",
                 f"Curve {where}: {_range_words(findings.unknown['values'], findings.unknown['unit'])}.",
             )
         )
@@ -364,9 +364,10 @@ def _force_words(residuals: Sequence[Residual]) -> str:
 _CURVES = {
     "N": "The force that repeats on runs that no fit saw",
     "m": "What the sensor reads too much in all runs",
+    "edge": "By how much both of the joint's edges lie further out than where it first touched",
     "ratio": "What the body feels of its motor's force of so long ago, beyond what is known of its drive",
 }
-"""What a curve shows, by its unit."""
+"""What a curve shows, by what it is of."""
 
 
 def _range_words(values: Sequence[float], unit: str) -> str:

@@ -89,7 +89,7 @@ def _are_exact(search: Competition, chosen: list[Group]) -> bool:
 
 
 def finer_curve(search: Competition, chosen: list[Group], material: float) -> Group | None:
-    """Return a finer curve that finds more of what is left than on noise, and than is material; None where none does.
+    """Return the finer curve that finds most, where that is more than on noise, and than is material; else None.
 
     A spring with a dead zone is a cable and two ripples as long as the travel, but for its two kinks: 5800 squares of
     388 000 were left, of which twelve knots found 350 and forty-eight 5000. A friction that grows with the time since
@@ -97,12 +97,13 @@ def finer_curve(search: Competition, chosen: list[Group], material: float) -> Gr
     360 and forty-eight 200, over that time sixteen found 4600.
     """
     now = search.judge.gain(chosen)
+    found = []
     for curve in search.finer_curves():
         gained = search.judge.gain([*chosen, curve]) - now
         search.judge.trace.append(f"{search.term(curve).name}, finer, on {curve.key[1]} finds {gained:.0f}")
         if gained > max(material, chi2.isf(_FINER_TAIL, len(curve.columns))):
-            return curve
-    return None
+            found.append((gained, curve))
+    return max(found, key=lambda one: one[0])[1] if found else None
 
 
 def one_curve_for_many(judge: Judge, chosen: list[Group]) -> tuple[list[Group], Group | None]:

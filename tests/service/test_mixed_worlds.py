@@ -154,7 +154,7 @@ def test_simulated_drives_are_stopped_where_the_real_interferometer_does_not_see
     backend = RigBackend(profile, "single-axis", seed=4, plays=RIG_DRIVES)
     with Supervisor(profile, backend, tmp_path / "run") as stage:
         outcome, began = home_arm_and_move(stage, backend)  # homing is by the drive's own encoder
-        # Held by what does not see it, the axis creeps as soon as it has power: on a slow host too far before it is to move.
+        # Held by what does not see it, the axis creeps as soon as it has power: on a slow host too far already.
         assert outcome.name == "enable" or outcome.name.startswith("moving to"), outcome
         assert outcome.stop is Stop.REFERENCE_LOST, outcome
         assert "macro laser and the drive's encoder differ" in outcome.detail
