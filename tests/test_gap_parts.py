@@ -28,6 +28,7 @@ from stagectl.gap.looks import Look, _has_reached_floor
 from stagectl.gap.noise import noise_of, slow_noise
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
 from stagectl.gap.selection import lacks_a_name, select
+from stagectl.gap.settling import remeasured
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
 from tests.blind import draw, generate
@@ -605,6 +606,17 @@ def test_edges_that_wear_are_a_curve_over_time_beside_a_wider_gap(tmp_path):
     values_m, sds_m = solve([*search.judge.base, found], search.evidence.sums).of(found)
     slope_m_per_s, _ = np.polyfit(knots_s, values_m, 1, w=1.0 / sds_m)
     assert slope_m_per_s == pytest.approx(0.5 * hidden.values["rate_m_per_s"], rel=0.3)  # each edge by half of it
+
+
+def test_what_moved_a_joint_and_is_nothing_at_its_size_is_not_told(tmp_path):
+    """Without a law of soft contacts a search ended with an error that named nothing (3087)."""
+    generate.write(generate.draw(3197, "single", 2.0), tmp_path)
+    blind = load_set(tmp_path)
+    recordings = [balance.recording_of(log, blind.believed) for log in blind.logs[-1:]]
+    moved = ((CATALOGUE["backlash_width_change"], "contact_edge", {"change_m": 1e-6}),)
+    search = Competition(recordings, 1, moved=moved, noise=noise_of(recordings))
+    solution = solve(search.judge.base, search.evidence.sums)
+    assert remeasured(search, solution, (), search.moved) == ()
 
 
 def test_a_look_above_more_noise_does_not_say_that_nothing_is_left():

@@ -263,14 +263,20 @@ def moved_now(search: Competition, chosen: list[Group]) -> tuple[Moved, ...]:
 def remeasured(
     search: Competition, solution: Solution, named: tuple[Named, ...], moved: tuple[Moved, ...]
 ) -> tuple[Named, ...]:
-    """Return the effects that moved the joint with the sizes and intervals that hold where they have put it."""
+    """Return the effects that moved the joint with the sizes and intervals that hold where they have put it.
+
+    What came out as nothing at its size has no name any more, though the look was taken under it.
+    """
     first = len(search.parameters)
+    names = {(one.name, one.acts_on): one for one in named}
     found = []
     for number, (effect, place, values) in enumerate(moved):
+        before = names.get((effect.name, place))
+        if before is None:
+            continue
         value, sd = solution.of(search.judge.base[first + number])
         name = effect.parameters[0]
         size = values[name]
-        before = next(one for one in named if (one.name, one.acts_on) == (effect.name, place))
         parameters = {**values, name: size * (1.0 + float(value[0]))}
         found.append(
             replace(before, parameters=parameters, sds={name: abs(size) * float(np.hypot(sd[0], INEXACT_RATIO))})
