@@ -3,15 +3,25 @@
 Sets of the blind suite, fewer and shorter runs of them; their truths are asked of the generator.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from bench.blind_sets import load_set
+from stagectl.effects import CATALOGUE
+from stagectl.gap import balance
+from stagectl.gap.aliases import aliases_of
+from stagectl.gap.competition import Competition
+from stagectl.gap.crew import Serial
 from stagectl.gap.findings import Findings
+from stagectl.gap.noise import slow_noise
+from stagectl.gap.recording import Recording
+from stagectl.gap.selection import select
+from stagectl.gap.settling import left_at_size
 from stagectl.gap.workflow import find
-from tests.blind import draw, generate
+from tests.blind import draw, generate, laws
 
 RUNS_COUNT = 2
 
@@ -80,3 +90,55 @@ def test_a_lag_is_told_from_a_delay_beside_all_names(tmp_path):
         ("command_delay", "macro_command"),
         ("cable_spring", "macro_force"),
     }
+
+
+def _recordings(case: draw.Case, folder: Path) -> list[Recording]:
+    generate.write(case, folder)
+    blind = load_set(folder)
+    return [balance.recording_of(log, blind.believed) for log in blind.logs]
+
+
+def _search(recordings: Sequence[Recording]) -> Competition:
+    noise = slow_noise(recordings[0].believed, recordings[0])
+    search = Competition(recordings, len(recordings), nulls_count=20, noise=noise)
+    search.judge.calibrate()
+    return search
+
+
+def _hidden(seed: int, duration_s: float, *effects: tuple[str, str, dict[str, float]]) -> draw.Case:
+    """Return a set with these effects and no other."""
+    case = generate.draw(seed, "null", duration_s)
+    by_name = {law.name: law for law in laws.LAWS}
+    case.effects = [draw.Effect(by_name[name], place, values) for name, place, values in effects]
+    case.runs = draw.simulate(case)
+    return case
+
+
+@pytest.mark.parametrize("seed", [2706, 2708])
+def test_a_scale_error_leaves_the_same_as_one_of_the_other_sensor(seed, tmp_path):
+    """Taken where each sample itself says, 1000 ppm made the noise smaller by as much: 17 and 6 squares less."""
+    recordings = _recordings(_hidden(seed, 3.0, ("scale_error", "end_sensor", {"relative": -1e-3})), tmp_path)[
+        :RUNS_COUNT
+    ]
+    noise = slow_noise(recordings[0].believed, recordings[0])
+    scales, left = None, []
+    for place, error_ppm in (("macro_sensor", 1e3), ("end_sensor", -1e3)):
+        moved = (CATALOGUE["scale_error"], place, {"error_ppm": error_ppm})
+        one = left_at_size(recordings, noise, (moved,), (), Serial(), scales)
+        scales, left = one.scales, [*left, one.squares]
+    assert left[0] == pytest.approx(left[1], abs=2.0)
+
+
+def test_a_tilt_beside_a_cable_is_an_offset_of_the_micro_and_a_cable_anchored_elsewhere(tmp_path):
+    """Beside a cable that stays where it is they are 160 deviations apart, and a tilt was named an offset."""
+    case = _hidden(
+        2913,
+        4.0,
+        ("tilt", "macro_force", {"angle_rad": 0.0016}),
+        ("cable_spring", "macro_force", {"stiffness_n_per_m": 44.0, "anchor_m": 0.01}),
+    )
+    search = _search(_recordings(case, tmp_path)[:RUNS_COUNT])
+    found = select(search.judge)
+    (other,) = (group for group in found if group.key[0] != "cable_spring")
+    names = {other.key, *(key for key, _ in aliases_of(search.judge, found, other))}
+    assert names == {("offset", "micro_force"), ("gravity_tilt", "macro_force")}

@@ -339,11 +339,11 @@ def test_two_that_only_stand_together_are_found():
     assert {group.key[0] for group in select(judge)} == {"one", "other"}
 
 
-@pytest.mark.parametrize(("is_left", "count"), [(False, 2), (True, 1)])
-def test_a_small_name_beside_a_large_one_stays_where_no_curve_finds_anything(is_left, count):
+@pytest.mark.parametrize(("size", "left", "count"), [(0.15, 0.0, 2), (0.15, 0.15, 1), (0.3, 0.1, 2)])
+def test_a_small_name_beside_a_large_one_stays_where_no_curve_finds_anything_or_little_is_left(size, left, count):
     def draw(run, random):
         large, small, rest = (random.standard_normal(4000) for _ in range(3))
-        hidden = 5.0 * large + 0.15 * small + (0.15 * rest if is_left else 0.0)
+        hidden = 5.0 * large + size * small + left * rest
         return [random.standard_normal(4000) + hidden, large, small, rest]
 
     large, small = Group(("large", "macro_force"), (1,)), Group(("small", "macro_force"), (2,))

@@ -80,7 +80,7 @@ def cyclic_error(position_m, first_m, second_m, wavelength_m, first_phase_rad, s
 @effect(
     places=_SENSORS,
     drift_m=(-1e-3, 1e-3),
-    time_constant_s=(1.0, 1e5),
+    time_constant_s=(10.0, 1e5),
     linear=("drift_m",),
     searched=("time_constant_s",),
     shown_by="time",

@@ -22,7 +22,8 @@ def aliases_of(judge: Judge, chosen: Sequence[Group], group: Group) -> list[tupl
 
     What acts about a place does so from along the travel: anchored ten metres away, a cable is an offset, whose set
     it was named in. The same law elsewhere does so at the same shape: a drift of the end's sensor over 52 s and one
-    of the macro's over 36 s were 10 squares apart, over 52 s both are one.
+    of the macro's over 36 s were 10 squares apart, over 52 s both are one. And what is chosen beside them may act about
+    another place: beside a cable a tilt of both bodies was an offset of the micro, and 1.1 N of the cable's.
     """
     rest = [other for other in chosen if other is not group]
     with_it = judge.gain(chosen)
@@ -30,16 +31,18 @@ def aliases_of(judge: Judge, chosen: Sequence[Group], group: Group) -> list[tupl
     left = judge.left_at_most(chosen)
     margins: dict[tuple[str, str], float] = {}
     taken = {other.key for other in chosen}
+    anchors = [moved for moved in judge.anchors_moved(chosen, group) if moved.key not in taken]
     for rival in judge.rivals(rest):
         if rival.key in taken or form(rival) > form(group):
             continue
-        forms = [one for one in judge.brought_near(rival, group) if judge.allows([*rest, one])]
+        beside = [*rest, *(moved for moved in anchors if moved.key != rival.key)]
+        forms = [one for one in judge.brought_near(rival, group) if judge.allows([*beside, one])]
         if not forms:
             continue
-        distances = [judge.distance([*rest, group], [*rest, one]) for one in forms]
+        distances = [judge.distance([*rest, group], [*beside, one]) for one in forms]
         apart = min(distances)
         other = forms[distances.index(apart)]
-        margin = with_it - judge.gain([*rest, other])
+        margin = with_it - judge.gain([*beside, other])
         share = margin / max(gained, 1e-300)
         inexact = margin < left and share < ALIAS_SHARE and _lies_between(margin, apart)
         if apart < ALIAS_GAIN or inexact or _is_rough_friction(judge, group, other, share):

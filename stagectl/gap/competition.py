@@ -1,6 +1,7 @@
 """All hypotheses on recordings at one operating point: known parameters, effects, curves, ready to compete. Pure."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from stagectl.gap import balance, curves, hypotheses, seeds
 from stagectl.gap.crew import Crew, Serial
 from stagectl.gap.evidence import Added, Evidence
 from stagectl.gap.forces import Forces, scaled_forces
-from stagectl.gap.grids import free_shapes, grids_for
+from stagectl.gap.grids import along_travel_m, free_shapes, grids_for
 from stagectl.gap.hypotheses import DEVIATION_SD, Term, widest_amplitudes
 from stagectl.gap.innovations import Noise
 from stagectl.gap.judge import Judge
@@ -19,6 +20,7 @@ from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import (
     Refiner,
+    anchor_of,
     but_for_size,
     counts_at_size,
     gain_at_size,
@@ -83,6 +85,7 @@ class Competition:
         self.judge = Judge(evidence, training_count, base, library, self._refined, self._gains_at_size)
         self.judge.curves = self.curves
         self.judge.brought_near = self._brought_near
+        self.judge.anchors_moved = self._anchors_moved
         self.judge.modelled = self._modelled()
         axes = [recordings[0].belief(axis) for axis in recordings[0].axes]
         self.judge.scale_sd_ratio = max(
@@ -174,6 +177,21 @@ class Competition:
                 shape = shape | {size: float(np.copysign(shape[size], term.shape[size]))}
             found += self._appended([with_shape(term, shape)], other) if shape != term.shape else []
         return found
+
+    def _anchors_moved(self, chosen: Sequence[Group], group: Group) -> list[Group]:
+        """Return the constant forces by which others than `group` pull differently from elsewhere along the travel."""
+        solution = solve([*self.judge.base, *chosen], self.evidence.sums)
+        constants = {one.key[1]: one for one in self.judge.library if one.key[0] == "offset"}
+        moved = []
+        for other in chosen:
+            term = self.term(other)
+            name, constant = anchor_of(term), constants.get(term.acts_on)
+            if other is not group and name is not None and constant is not None:
+                stiffness_n_per_m = float(np.mean(solution.of(other)[0]))
+                places_m = along_travel_m(self.evidence.recordings)
+                pull_n = [stiffness_n_per_m * (place_m - term.shape[name]) for place_m in places_m]
+                moved.append(replace(constant, bounds=((min(0.0, *pull_n), max(0.0, *pull_n)),)))
+        return moved
 
     def _appended(self, terms: list[Term], like: Group) -> list[Group]:
         columns = self._crew.here(self.evidence.columns_of, terms)

@@ -100,12 +100,18 @@ def _of_sensor(recording: Recording, axis: str) -> dict[str, np.ndarray]:
         known[name] = motion.at_samples[:, place : place + 1]
     place_m, sd_m = _at_readings(recording, axis)
     return known | {
-        "position_m": place_m[:, None],
-        "position_sd_m": sd_m[:, None],
+        AT_READING: place_m[:, None],
+        AT_READING_SD: sd_m[:, None],
         "t_s": (log.start_s + log.times_s)[:, None],
         "dt_s": np.full((log.samples_count, 1), log.period_s),
     }
 
+
+AT_READING, AT_READING_SD = "position_at_reading_m", "position_at_reading_sd_m"
+"""Where a body is at a sample, by that sample too, and how surely: for errors that repeat within what a foretold place
+is uncertain by. Every other error is taken at the place foretold: taken where the sample itself says, a scale error of
+234 ppm made readings and their noise smaller by so much, and left 32 squares less as one of the macro's sensor than as
+the one of the end's that it was, from which nobody can tell it; foretold, both leave the same to 0.001."""
 
 _MOVED_NOISES = 10.0
 """Way from sample to sample, over the sensor's noise, beyond which a sample may say where it was taken: where a stage

@@ -7,7 +7,7 @@ from stagectl.effects import Effect, Trait
 from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.contact import more_push_n
 from stagectl.gap.forces import Forces
-from stagectl.gap.quantities import along_motion, quantities
+from stagectl.gap.quantities import AT_READING, AT_READING_SD, along_motion, quantities
 from stagectl.gap.recording import Recording, contact_push_n, relative_motion
 
 _READING_PASSES = 2
@@ -43,7 +43,7 @@ def _mean_error_m(effect: Effect, known: dict[str, np.ndarray], parameters: list
     """Return an error's mean over all places where the body may be: beside 26 nm of noise 15.0 nm came out as 14.3."""
     total = np.zeros_like(known["position_m"])
     for place, share in _POINTS:
-        there = known | {"position_m": known["position_m"] + place * known["position_sd_m"]}
+        there = known | {"position_m": known[AT_READING] + place * known[AT_READING_SD]}
         total += share * along_motion(effect, [there[name] for name in effect.quantities], parameters)
     return total
 

@@ -477,11 +477,19 @@ def with_shape(term: Term, changed: dict[str, float]) -> Term:
     return hypotheses.term_at_size(effect, term.acts_on, shape)
 
 
+def anchor_of(term: Term) -> str | None:
+    """Return the name of the place that a law acts about; None of others."""
+    if term.acts_on == "parameter" or Trait.PLACED not in CATALOGUE[term.name].traits:
+        return None
+    (name,) = free_shapes(CATALOGUE[term.name])
+    return name
+
+
 def nearest_place(recordings: Sequence[Recording], term: Term) -> Term:
     """Return a law that acts about a place at the one nearest to it along the travel; others as are."""
-    if term.acts_on == "parameter" or Trait.PLACED not in CATALOGUE[term.name].traits:
+    name = anchor_of(term)
+    if name is None:
         return term
-    (name,) = free_shapes(CATALOGUE[term.name])
     low_m, high_m = along_travel_m(recordings)
     place_m = float(np.clip(term.shape[name], low_m, high_m))
     return term if place_m == term.shape[name] else with_shape(term, {name: place_m})
