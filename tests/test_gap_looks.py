@@ -142,3 +142,15 @@ def test_a_tilt_beside_a_cable_is_an_offset_of_the_micro_and_a_cable_anchored_el
     (other,) = (group for group in found if group.key[0] != "cable_spring")
     names = {other.key, *(key for key, _ in aliases_of(search.judge, found, other))}
     assert names == {("offset", "micro_force"), ("gravity_tilt", "macro_force")}
+
+
+def test_what_takes_the_place_of_all_that_was_found_before_stays(tmp_path):
+    """A shifted joint was nothing beside the drift that it had been taken for, and both were lost: unknown."""
+    case = generate.draw(3352, None)
+    generate.write(case, tmp_path)
+    blind = load_set(tmp_path)
+    findings = find(blind.believed, list(blind.logs), [], nulls_count=20)
+    (found,) = findings.named
+    places = {(found.name, found.acts_on), *(alias[:2] for alias in found.aliases)}
+    assert places == {("thermal_drift", "end_sensor"), ("thermal_drift", "macro_sensor")}
+    assert found.gain == pytest.approx(findings.reducible_before[0], rel=0.05)

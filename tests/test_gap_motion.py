@@ -21,7 +21,7 @@ from stagectl.gap.naming import ending, friction_that_drives, refitted_errors, s
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group, solve
 from stagectl.gap.operating_point import operating_point, with_joint_changed
-from stagectl.gap.quantities import quantities
+from stagectl.gap.quantities import AT_READING, AT_READING_SD, quantities
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner
 from stagectl.gap.reversals import since_reversal
@@ -394,6 +394,7 @@ def test_an_error_that_is_known_is_taken_out_where_the_body_is_known_better(fore
     there = quantities(known, "macro", "macro_sensor")
     moves = np.abs(motion.at_samples[:, 1]) * recording.log.period_s > 20.0 * NOISE_M
     assert np.any(moves)
-    place_m, sd_m = (there[name][moves, 0] for name in ("position_m", "position_sd_m"))
+    place_m, sd_m = (there[name][moves, 0] for name in (AT_READING, AT_READING_SD))
     np.testing.assert_array_equal(place_m, motion.known_m[moves] if by_sample else motion.at_samples[moves, 0])
     np.testing.assert_array_equal(sd_m, 0.4e-9 if by_sample else foretold_sd_m)
+    np.testing.assert_array_equal(there["position_m"][:, 0], motion.at_samples[:, 0])

@@ -339,11 +339,13 @@ def test_two_that_only_stand_together_are_found():
     assert {group.key[0] for group in select(judge)} == {"one", "other"}
 
 
-@pytest.mark.parametrize(("size", "left", "count"), [(0.15, 0.0, 2), (0.15, 0.15, 1), (0.3, 0.1, 2)])
-def test_a_small_name_beside_a_large_one_stays_where_no_curve_finds_anything_or_little_is_left(size, left, count):
+@pytest.mark.parametrize(
+    ("sizes", "left", "count"), [((5.0, 0.15), 0.0, 2), ((5.0, 0.15), 0.15, 1), ((8.0, 0.5), 0.1, 2)]
+)
+def test_a_small_name_beside_a_large_one_stays_where_no_curve_finds_anything_or_little_is_left(sizes, left, count):
     def draw(run, random):
         large, small, rest = (random.standard_normal(4000) for _ in range(3))
-        hidden = 5.0 * large + size * small + left * rest
+        hidden = sizes[0] * large + sizes[1] * small + left * rest
         return [random.standard_normal(4000) + hidden, large, small, rest]
 
     large, small = Group(("large", "macro_force"), (1,)), Group(("small", "macro_force"), (2,))
