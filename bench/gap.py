@@ -116,7 +116,7 @@ def _part(say: Say, until_s: float) -> Iterator[Figure]:
     jobs = [Job(seed, None, sets_folder()) for seed in PART_SEEDS]
     found = _marked(searched(jobs, workers, until_s - LEFT_OUT_S), say)
     yield from suite_figures.suite(found, full=False)
-    yield left_out.figure(found, False, say, PART_LEFT_OUT_COUNT, until_s)
+    yield from left_out.figures(found, False, say, PART_LEFT_OUT_COUNT, until_s)
     yield from suite_figures.effect_by_effect(found)
 
 
@@ -135,7 +135,7 @@ def _full(say: Say) -> Iterator[Figure]:
     found = [marked(done[seed]) for seed in sorted(done)]
     measured = [
         *suite_figures.suite(found, full=True),
-        left_out.figure(found, True, say, None, float("inf")),
+        *left_out.figures(found, True, say, None, float("inf")),
         *suite_figures.effect_by_effect(found),
     ]
     run.end(done, measured, time.monotonic() - begin_s)

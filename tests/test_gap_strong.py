@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import t as student
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, hypotheses, looks, seeds
@@ -14,12 +15,13 @@ from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Serial
 from stagectl.gap.curvature import at_best_shapes
 from stagectl.gap.evidence import Evidence
+from stagectl.gap.findings import SIGMAS
 from stagectl.gap.known_motion import moved_under
 from stagectl.gap.log import Log
 from stagectl.gap.looks import Look
 from stagectl.gap.naming import all_named, measured
 from stagectl.gap.noise import slow_noise
-from stagectl.gap.normal_equations import Group, solve
+from stagectl.gap.normal_equations import Group, Scatter, solve
 from stagectl.gap.recording import Recording
 from stagectl.gap.refinement import Refiner, power_of_size
 from stagectl.gap.selection import select
@@ -335,6 +337,23 @@ def test_a_law_that_is_not_exact_is_as_uncertain_as_stretches_differ(uneven: flo
     (scale,), _ = solution.of(mass)
     assert abs(value * (1.0 + scale) - true) < 3.0 * np.hypot(sd, true * solution.of(mass)[1][0])
     assert least <= sd / solve([*search.judge.base, *chosen], search.evidence.sums).of(chosen[0])[1][0] < most
+
+
+@pytest.mark.parametrize(("stretches", "freedom"), [((1.0,) * 6, 5.0), ((4.0, 4.0, 4.0, 4.0) + (0.05,) * 8, 3.2)])
+def test_a_deviation_by_few_stretches_is_larger_by_what_their_scatter_does_not_tell(stretches, freedom: float):
+    """Stated as if many had told of it, 1.96 of it held 89 and 84 % of what they should hold 95 % of."""
+    random, weights = np.random.default_rng(4), np.ones(1)
+    tells = np.array(stretches)
+    whole, count = tells.sum(), tells.size
+    drawn = tells * random.normal(size=(20_000, count))  # every stretch has a true value of its own
+    values = drawn.sum(axis=1) / whole
+    spread = count / (count - 1.0) * np.sum((drawn - tells * values[:, None]) ** 2, axis=1)
+    of_noise = (tells / whole**2)[:, None, None]
+    sds = np.sqrt([Scatter(np.array([[one]]), of_noise).variance_of(weights) for one in spread / whole**2])
+    plain = np.mean(np.abs(values) < SIGMAS * np.sqrt(spread) / whole)
+    assert plain < 0.90
+    assert 0.93 < np.mean(np.abs(values) < SIGMAS * sds) < 0.97
+    assert sds[0] * whole / np.sqrt(spread[0]) == pytest.approx(student.ppf(0.975, freedom) / SIGMAS, rel=0.03)
 
 
 def _late(delay_s: float) -> Callable[[float, float, float], float]:

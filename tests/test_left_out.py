@@ -60,6 +60,17 @@ def test_the_share_of_right_answers_is_held_against_its_bar():
     assert left_out.judged([], [], full=True).value is None
 
 
+def test_where_the_nearest_law_leaves_less_than_the_floor_scatters_by_no_rest_is_asked_for():
+    def single(seed, distance):
+        return one(seed, "single", (), member() | {"nearest": [["mass_error", "macro_force", distance]]}, sd=100.0)
+
+    near, far, farther = single(1, 22.0), single(2, 24.0), single(3, 300.0)
+    figure = left_out.judged_shown([near, far, farther], [False, False, True], full=True)
+    assert (figure.value, figure.holds, figure.seeds) == (pytest.approx(50.0), None, [2, 3])
+    assert "1 others" in figure.reason
+    assert left_out.judged_shown([near], [True], full=True).value is None
+
+
 # ---- laws that are together another one ------------------------------------------------------------------------------
 
 

@@ -15,10 +15,10 @@ from stagectl.effects import CATALOGUE
 from stagectl.effects.table import TABLES
 from stagectl.errors import ProfileError, RequestError
 from stagectl.gap.applicable import is_tabled, origin_of, refuse_damaged, refuse_other_profile
-from stagectl.gap.findings import Findings, Named
+from stagectl.gap.findings import SIGMAS, Findings, Named
 from stagectl.gap.parameter_application import parameters_of_keys, write_parameter, write_refitted
 from stagectl.gap.profile_sheet import Change, Sheet, below_title, mark_of, plain
-from stagectl.gap.session_values import SIGMAS, values_of
+from stagectl.gap.session_values import values_of
 
 
 @dataclass(frozen=True, slots=True)

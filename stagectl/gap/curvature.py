@@ -17,7 +17,7 @@ from stagectl.gap.effect_forces import effect_forces
 from stagectl.gap.forces import Forces, scaled_forces
 from stagectl.gap.grids import free_shapes
 from stagectl.gap.hypotheses import Term, widest_amplitudes
-from stagectl.gap.normal_equations import Group, Solution, solve
+from stagectl.gap.normal_equations import Group, Scatter, Solution, solve
 from stagectl.gap.operating_point import Moved
 from stagectl.gap.quantities import in_order
 from stagectl.gap.recording import Recording
@@ -186,8 +186,10 @@ def _with_slopes(search: Competition, chosen: Sequence[Group], slopes: Sequence[
     places = [at[slot] for slot in plain.slots]
     weights = np.array([ratios[slot] for slot in plain.slots])
 
-    def of_plain(covariance: np.ndarray) -> np.ndarray:
-        return covariance[np.ix_(places, places)] * np.outer(weights, weights)
+    def of_plain(covariances: np.ndarray) -> np.ndarray:
+        return covariances[..., places, :][..., places] * np.outer(weights, weights)
 
-    spread = tuple(of_plain(one) for one in scattered(search.evidence, joint, fixed))
+    spread = tuple(
+        Scatter(of_plain(one.covariance), of_plain(one.of_noise)) for one in scattered(search.evidence, joint, fixed)
+    )
     return replace(plain, covariance=of_plain(joint.covariance), scattered=spread)

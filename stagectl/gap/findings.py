@@ -5,6 +5,9 @@ from typing import Any
 
 PARAMETER = "parameter"
 
+SIGMAS = 1.96
+"""So many of any deviation that is stated here are the half width of a 95 % interval."""
+
 
 def title_of(name: str, acts_on: str) -> str:
     """Say what a finding is about."""

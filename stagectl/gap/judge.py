@@ -33,8 +33,8 @@ EXPLAINED_SHARE = 0.2
 MOST_SHARE = 0.8
 """Of all that is left at most, from what on a hypothesis is what was left, whatever a curve still finds: beside 215
 million squares of a Stribeck friction and a base that shakes, a saturation that was there gained 31 900 of 34 900, and
-of the 3000 behind it curves found half. Not of a machine with force noise: what is left of that counts as noise, and a
-cable gained 930 of 65."""
+of the 3000 behind it the best curve found 770. Not of a machine with force noise: what is left of that counts as noise,
+and a cable gained 930 of 65."""
 
 SMOOTH_RATIO = 2e-5
 """The same of what smooth laws have gained: forces of place, time, command and speed along a motion that is measured to

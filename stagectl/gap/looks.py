@@ -163,7 +163,9 @@ def _without_nothing(case: _Case, course: _Course, look: Look, at_size: tuple[Na
         return None
     is_first = before.search is case.first
     left, here = _without(before, gone), _without(look, gone)
-    known = left if left.chosen or not here.chosen else _in_place_of_all(case.first, here) if is_first else here
+    known = left
+    if here.chosen and not left.chosen:
+        known = _in_place_of_all(case.first, here) if is_first else here
     return known, course._replace(
         known=known,
         plain=left if is_first else course.plain,

@@ -11,6 +11,9 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.special import stdtrit
+
+from stagectl.gap.findings import SIGMAS
 
 _JITTER = 1e-10
 _BOUND_SDS = 2.0
@@ -56,6 +59,32 @@ class Group:
         return len(self.columns) * self.places_count + self.searched
 
 
+_LEAST_FREEDOM = 3.0  # of one stretch alone nothing is known, and t would be any number
+
+
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """How amplitudes scatter from stretch to stretch of the recordings.
+
+        f = (sum_s w_s)^2 / sum_s w_s^2 - 1,   w_s = a' N_s a
+
+    a are the weights of a sum of amplitudes, N_s what white noise in one stretch makes of the amplitudes, f how many
+    degrees of freedom the scatter of that sum has: one stretch that tells most of it says little of how it scatters
+    (Satterthwaite 1946; Bell, McCaffrey 2002). A deviation is stated so that 1.96 of them hold 95 % of Student's t.
+    """
+
+    covariance: np.ndarray
+    of_noise: np.ndarray  # shape (stretches, amplitudes, amplitudes)
+
+    def variance_of(self, weights: np.ndarray) -> float:
+        """Return the variance of a weighted sum of all amplitudes."""
+        parts = np.einsum("i,sij,j->s", weights, self.of_noise, weights)
+        squares = float(parts @ parts)
+        freedom = float(parts.sum()) ** 2 / squares - 1.0 if squares > 0.0 else np.inf
+        factor = float(stdtrit(max(freedom, _LEAST_FREEDOM), 0.975)) / SIGMAS
+        return factor**2 * float(weights @ self.covariance @ weights)
+
+
 @dataclass(frozen=True, slots=True)
 class Solution:
     """Amplitudes of some groups on some recordings, and what they gain over none at all."""
@@ -66,7 +95,7 @@ class Solution:
     covariance: np.ndarray
     normal: np.ndarray  # of the amplitudes, priors included
     gain: float  # over none of them, and over what is fixed
-    scattered: tuple[np.ndarray, ...] = ()  # covariances by how stretches of the recordings scatter, where asked for
+    scattered: tuple[Scatter, ...] = ()  # by stretches of several lengths, where asked for
 
     def of(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
         """Return values and standard deviations of one group, sessions one after the other."""
@@ -75,8 +104,8 @@ class Solution:
 
     def sd_of(self, weights: np.ndarray) -> float:
         """Return the standard deviation of a weighted sum of all amplitudes: the largest of all that are known."""
-        variances = [float(weights @ one @ weights) for one in (self.covariance, *self.scattered)]
-        return float(np.sqrt(max(*variances, 0.0)))
+        scattered = [one.variance_of(weights) for one in self.scattered]
+        return float(np.sqrt(max(float(weights @ self.covariance @ weights), *scattered, 0.0)))
 
     def covariance_of(self, weights: np.ndarray, others: np.ndarray) -> float:
         """Return the covariance of two weighted sums of all amplitudes, by what their sum and difference scatter."""

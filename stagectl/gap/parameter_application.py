@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import addition
-from stagectl.gap.findings import Findings, ParameterError
+from stagectl.gap.findings import SIGMAS, Findings, ParameterError
 from stagectl.gap.hypotheses import parts_of
 from stagectl.gap.profile_sheet import Change, Sheet
-from stagectl.gap.session_values import SIGMAS
 
 _LEAST_RATIO = 1e-3  # effects of the profile that were refitted by less stay as they are
 

@@ -24,7 +24,7 @@ from stagectl.gap.addition import parted
 from stagectl.gap.believed import Believed
 from stagectl.gap.coloured_rest import filters_of, whitened_rest
 from stagectl.gap.effect_forces import effect_forces
-from stagectl.gap.findings import Findings, Named, ParameterError
+from stagectl.gap.findings import SIGMAS, Findings, Named, ParameterError
 from stagectl.gap.forces import Forces, scaled_forces
 from stagectl.gap.grids import grids_for
 from stagectl.gap.hypotheses import Term
@@ -39,10 +39,6 @@ from stagectl.gap.predicted_columns import (
     stacked_columns,
 )
 from stagectl.gap.recording import Recording
-
-SIGMAS = 1.96
-"""Of a 95 % interval."""
-
 
 LAW_SD_RATIO = 0.003
 """How exact a law is along a motion that is only measured: a true friction of 6 N showed 99.6 % of itself."""

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stagectl.gap.evidence import INNOVATIONS, Evidence
-from stagectl.gap.normal_equations import Solution, active_slots, covers
+from stagectl.gap.normal_equations import Scatter, Solution, active_slots, covers
 
 _STRETCHES_S = (0.25, 1.0, 4.0)
 """What is missing may last as long as a reversal or as long as a move."""
@@ -26,30 +26,36 @@ _LEAST_STRETCHES = 4
 """Fewer tell nothing of their scatter."""
 
 
-def scattered(evidence: Evidence, solution: Solution, fixed: Sequence[int] = ()) -> tuple[np.ndarray, ...]:
-    """Return covariances of a solution's amplitudes by the scatter of stretches, one for each length of them.
+def scattered(evidence: Evidence, solution: Solution, fixed: Sequence[int] = ()) -> tuple[Scatter, ...]:
+    """Return how a solution's amplitudes scatter between stretches, one for each length of them.
 
     fixed: columns that stand beside the amplitudes at 1.
     """
     precision = np.diag(active_slots(solution.groups, evidence.sums)[1])
     found = []
     for stretch_s in _STRETCHES_S:
-        scores = np.concatenate([_scores(evidence, k, solution, fixed, stretch_s) for k in range(len(evidence.sums))])
+        each = [_scores(evidence, k, solution, fixed, stretch_s) for k in range(len(evidence.sums))]
+        scores, normals = (np.concatenate(one) for one in zip(*each, strict=True))
         count = scores.shape[0]
         if count >= _LEAST_STRETCHES:
             spread = count / (count - 1.0) * scores.T @ scores + precision
-            found.append(solution.covariance @ spread @ solution.covariance)
+            of_noise = solution.covariance @ normals @ solution.covariance
+            found.append(Scatter(solution.covariance @ spread @ solution.covariance, of_noise))
     return tuple(found)
 
 
 def _scores(
     evidence: Evidence, recording: int, solution: Solution, fixed: Sequence[int], stretch_s: float
-) -> np.ndarray:
-    """Return the scores of the stretches of one recording, channels summed, shape (stretches, amplitudes)."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what the stretches of one recording say of the amplitudes, channels summed.
+
+    Their scores, shape (stretches, amplitudes), and their normal matrices.
+    """
     origin, log = evidence.origins[recording], evidence.recordings[recording].log
     stretches = max(round(log.samples_count * log.period_s / stretch_s), 1)
     here = np.array([k for k, (_, scope) in enumerate(solution.slots) if covers(scope, origin)], dtype=int)
     total = np.zeros((stretches, len(solution.slots)))
+    normals = np.zeros((stretches, len(solution.slots), len(solution.slots)))
     for channel in evidence.channels[recording]:
         present, rows = channel.of([solution.slots[k][0] for k in here])
         if rows is None:
@@ -57,6 +63,10 @@ def _scores(
         _, beside = channel.of(fixed)
         left = channel.rows[INNOVATIONS] - solution.values[here[present]] @ rows
         left = left if beside is None else left - beside.sum(axis=0)
-        parts = np.array_split(rows * left, stretches, axis=1)
-        total[:, here[present]] += np.stack([part.sum(axis=1) for part in parts])
-    return total
+        own = np.ix_(here[present], here[present])
+        for number, (part, rest) in enumerate(
+            zip(np.array_split(rows, stretches, axis=1), np.array_split(left, stretches), strict=True)
+        ):
+            total[number, here[present]] += part @ rest
+            normals[number][own] += part @ part.T
+    return total, normals

@@ -6,11 +6,8 @@ from collections.abc import Sequence
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import addition
-from stagectl.gap.findings import Named
+from stagectl.gap.findings import SIGMAS, Named
 from stagectl.gap.hypotheses import phase_of
-
-SIGMAS = 1.96
-"""Of a 95 % interval."""
 
 
 def values_of(effect: Named) -> dict[str, tuple[float, float | None, str]]:
