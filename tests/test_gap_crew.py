@@ -51,6 +51,30 @@ def test_two_threads_find_the_same_to_the_last_bit(blind, serial):
         assert dataclasses.asdict(_found(blind, crew)) == dataclasses.asdict(serial)
 
 
+def test_who_has_nothing_to_do_helps_with_a_part_of_a_task():
+    with Threads(2) as crew:
+        both = threading.Barrier(2, timeout=10.0)  # passes only where two are there at a time
+        crew.here(lambda _: crew.helped(lambda _: both.wait(), range(2)), range(1))
+        assert crew.helped(lambda number: 10 * number, range(5)) == [0, 10, 20, 30, 40]
+
+
+def test_where_all_are_busy_nobody_helps():
+    begun, ended = threading.Barrier(2, timeout=10.0), threading.Barrier(2, timeout=10.0)
+
+    def task(_: int) -> bool:
+        begun.wait()
+        threads = crew.helped(lambda _: threading.get_ident(), range(4))
+        ended.wait()  # both are at work until both have asked
+        return set(threads) == {threading.get_ident()}
+
+    with Threads(2) as crew:
+        assert crew.here(task, range(2)) == [True, True]
+        with pytest.raises(ZeroDivisionError):
+            crew.helped(lambda number: 1 // number, range(2))
+        assert crew.helped(lambda _: threading.get_ident(), range(2)) != [threading.get_ident()] * 2  # helps again
+    assert crew.helped(lambda _: threading.get_ident(), range(2)) == [threading.get_ident()] * 2  # and not any more
+
+
 def test_a_cluster_finds_the_same_to_the_last_bit(blind, serial, cluster):
     assert serial.named, serial.trace  # something was searched, so something had to travel
     with Dask(cluster.scheduler_address) as crew:

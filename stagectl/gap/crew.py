@@ -43,6 +43,10 @@ class Crew(Protocol):
         """Do a task for each item in this process: its results are large, or it can't travel."""
         ...
 
+    def helped(self, task: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """Do a part of a task for each item, in the thread that asks and in those that have nothing to do."""
+        ...
+
     def map(self, task: Callable[..., Result], shared: Sequence[object], items: Iterable[Item]) -> list[Result]:
         """Return task(*shared, item) for each item, in their order; all of it can be pickled, `shared` travels once."""
         ...
@@ -59,6 +63,10 @@ class Serial:
 
     def here(self, task: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """Do a task for each item."""
+        return [task(item) for item in items]
+
+    def helped(self, task: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """Do a part of a task for each item."""
         return [task(item) for item in items]
 
     def map(self, task: Callable[..., Result], shared: Sequence[object], items: Iterable[Item]) -> list[Result]:
@@ -87,15 +95,53 @@ class Threads:
         if workers_count < 1:
             raise RequestError(f"{workers_count} workers do nothing; give 1 or more, at most as many as processors")
         self._pool = ThreadPoolExecutor(workers_count, thread_name_prefix="gap")
+        self._helpers = ThreadPoolExecutor(workers_count, thread_name_prefix="gap-helper")
+        self._workers_count, self._busy_count, self._lock = workers_count, 0, threading.Lock()
         self._interval_s = sys.getswitchinterval()
 
     def here(self, task: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """Do a task for each item."""
-        return list(self._pool.map(task, items))
+
+        def counted(item: Item) -> Result:
+            self._count(1)
+            try:
+                return task(item)
+            finally:
+                self._count(-1)
+
+        return list(self._pool.map(counted, items))
+
+    def helped(self, task: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """Do a part of a task for each item, in the thread that asks and in those that have nothing to do.
+
+        Of a search on two recordings the shapes of bristles took half the time, one search after the other: 30.4 s with
+        two threads, 23.3 s where the second one takes one of the recordings.
+        """
+        helpers_count = self._taken(len(items) - 1)
+        if helpers_count == 0:
+            return [task(item) for item in items]
+        shares = [items[first :: helpers_count + 1] for first in range(helpers_count + 1)]
+        try:
+            others = [self._helpers.submit(lambda share=share: [task(item) for item in share]) for share in shares[1:]]
+            done = [[task(item) for item in shares[0]], *(one.result() for one in others)]
+        finally:
+            self._count(-helpers_count)
+        return [done[number % len(done)][number // len(done)] for number in range(len(items))]
+
+    def _taken(self, most: int) -> int:
+        """Take as many threads as have nothing to do, and return how many; who asks has something to do."""
+        with self._lock:
+            count = max(min(most, self._workers_count - max(self._busy_count, 1)), 0)
+            self._busy_count += count
+        return count
+
+    def _count(self, change: int) -> None:
+        with self._lock:
+            self._busy_count += change
 
     def map(self, task: Callable[..., Result], shared: Sequence[object], items: Iterable[Item]) -> list[Result]:
         """Return task(*shared, item) for each item."""
-        return list(self._pool.map(lambda item: task(*shared, item), items))
+        return self.here(lambda item: task(*shared, item), items)
 
     def __enter__(self) -> Self:
         """Hand the interpreter on sooner while the threads work: what waits for it 5 ms could compute meanwhile."""
@@ -105,7 +151,9 @@ class Threads:
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         """End the threads; after an error or Ctrl-C what has not begun never begins."""
         sys.setswitchinterval(self._interval_s)
-        self._pool.shutdown(wait=error is None, cancel_futures=True)
+        self._workers_count = 1  # nobody helps any more
+        for pool in (self._pool, self._helpers):
+            pool.shutdown(wait=error is None, cancel_futures=True)
 
 
 def crew_of(workers_count: int) -> Serial | Threads:
@@ -177,6 +225,10 @@ class Dask:
 
     def here(self, task: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """Do a task for each item: what is large stays here."""
+        return [task(item) for item in items]
+
+    def helped(self, task: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """Do a part of a task for each item, in this process."""
         return [task(item) for item in items]
 
     def map(self, task: Callable[..., Result], shared: Sequence[object], items: Iterable[Item]) -> list[Result]:

@@ -124,11 +124,13 @@ class Evidence:
 
     def columns_of(self, term: Term) -> Columns:
         """Return the columns of a term in units of the noise."""
-        found: Columns = []
-        for recording, channels in zip(self.recordings, self.channels, strict=True):
+
+        def of_one(number: int) -> list[np.ndarray | None]:
+            recording, channels = self.recordings[number], self.channels[number]
             parts = [balance.column(recording, forces) for forces in term.forces(recording)]
-            found.append([_stacked([part[c] for part in parts], channel.scale) for c, channel in enumerate(channels)])
-        return found
+            return [_stacked([part[c] for part in parts], channel.scale) for c, channel in enumerate(channels)]
+
+        return self.crew.helped(of_one, range(len(self.recordings)))
 
     def columns_of_trial(self, term: Term) -> Columns:
         """Return the columns of a term that is looked at beside other groups again."""
