@@ -625,14 +625,18 @@ def test_a_look_above_more_noise_does_not_say_that_nothing_is_left():
     """A gap that is 22 um wider had left 16 mN of force noise, above which nothing was left."""
     recordings = [balance.recording_of(_axis_log("run 1", 1.0, 1, ripple_n=0.05), _believed())]
     (level,) = slow_noise(_believed(), recordings[0]).values()
-    plain, look = (
-        _look(recordings, {"macro": dataclasses.replace(level, white_force_n=force_n)}) for force_n in (0.256, 0.0)
+    plain, quieter, look = (
+        _look(recordings, {"macro": dataclasses.replace(level, white_force_n=force_n)})
+        for force_n in (0.256, 0.03, 0.0)
     )
     assert unknown_rest(look.search, look.chosen, excess(look.search.judge, [])) is not None
     assert unknown_rest(plain.search, plain.chosen, excess(plain.search.judge, [])) is None
     assert excess(plain.search.judge, plain.chosen) < excess(look.search.judge, look.chosen)
     assert not _has_reached_floor(plain, look, {"gain": 2000.0, "left": 1200.0})  # a curve's
     assert _has_reached_floor(plain, look, {"gain": 500.0, "left": 21700.0})  # what a law is inexact by
+    # a machine without force noise has none: 0.7 % is more than exact laws leave, above whatever level
+    assert unknown_rest(quieter.search, quieter.chosen, excess(quieter.search.judge, [])) is None
+    assert not _has_reached_floor(quieter, look, {"gain": 500.0, "left": 21700.0})
 
 
 def _look(recordings, noise) -> Look:

@@ -46,8 +46,12 @@ def _noise(search: Competition) -> float:
     return float(np.sqrt(2.0 * sum(s.count for s in search.evidence.sums)))
 
 
-def unknown_rest(search: Competition, chosen: list[Group], before_excess: float) -> dict[str, Any] | None:
+def unknown_rest(
+    search: Competition, chosen: list[Group], before_excess: float, is_exact: bool = False
+) -> dict[str, Any] | None:
     """Return what no effect explains, with the curve that goes furthest, or None where the floor is reached.
+
+    is_exact: what stands is known to be exact from a look at the same machine above less noise.
 
     Names are worth stating only where with them nothing is left: a law of the library that fits an unknown force half
     is a wrong name.
@@ -67,8 +71,10 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
             best, gained = curve, gain
     judge.trace.append(f"left over {left:.0f} of {first:.0f}, noise {noise:.0f}, best curve {gained:.0f}")
     left_share, curve_share, finer_share = _LEFT_SHARE, _CURVE_SHARE, _FINER_SHARE
-    if _are_exact(search, chosen):
-        left_share, curve_share, finer_share = _EXACT_LEFT_SHARE, _EXACT_CURVE_SHARE, _EXACT_CURVE_SHARE
+    if is_exact or are_exact(search, chosen):
+        left_share, curve_share = _EXACT_LEFT_SHARE, _EXACT_CURVE_SHARE
+    if are_exact(search, chosen):
+        finer_share = _EXACT_CURVE_SHARE
     floor = _LEFT_SDS * noise + left_share * max(first, 0.0)
     least = max(CURVE_GAIN * judge.threshold, curve_share * max(first, 0.0))
     if not left > floor and not gained > least:
@@ -80,7 +86,7 @@ def unknown_rest(search: Competition, chosen: list[Group], before_excess: float)
     return _curve_found(search, chosen, best, left, first, gained)
 
 
-def _are_exact(search: Competition, chosen: list[Group]) -> bool:
+def are_exact(search: Competition, chosen: list[Group]) -> bool:
     """Tell whether what stands is laws of the library alone, and the machine has no force noise of its own.
 
     Of a user's own effect nobody knows that its shape is found to the end: one left 0.9 % of what it had explained.
