@@ -66,7 +66,7 @@ class _GapGroup(typer.core.TyperGroup):
 _SEARCH = "search"
 gap_app = typer.Typer(
     cls=_GapGroup,
-    help="Experimental: find which effect a profile lacks, and add it. `gap PROFILE RUN...` is `gap search` in short.",
+    help="Find which effect a profile lacks, and add it. `gap PROFILE RUN...` is `gap search` in short.",
     epilog=_epilog("stagectl gap my-stage.toml run-1 run-2", "stagectl gap apply my-stage.toml gap -o better.toml"),
     no_args_is_help=True,
 )
@@ -543,7 +543,7 @@ def gap_search(
     dask: DaskAddress = None,
     json: Json = False,
 ) -> None:
-    """Experimental: find which effect the profile lacks. Names are candidates, not yet proved on the hidden suite."""
+    """Find which effect the profile lacks. Names are candidates until a move foretold by `gap next` confirms them."""
     work = commands.gap.search
     _deliver("gap", json, lambda voice: work(voice, profile, run, holdout or [], runs, out, seed, workers, dask))
 
