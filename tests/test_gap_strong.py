@@ -341,7 +341,7 @@ def test_a_law_that_is_not_exact_is_as_uncertain_as_stretches_differ(uneven: flo
 
 @pytest.mark.parametrize(("stretches", "freedom"), [((1.0,) * 6, 5.0), ((4.0, 4.0, 4.0, 4.0) + (0.05,) * 8, 3.2)])
 def test_a_deviation_by_few_stretches_is_larger_by_what_their_scatter_does_not_tell(stretches, freedom: float):
-    """Stated as if many had told of it, 1.96 of it held 89 and 84 % of what they should hold 95 % of."""
+    """Stated as if many had told of it, 1.96 of it held 89 and 83 % of what they should hold 95 % of."""
     random, weights = np.random.default_rng(4), np.ones(1)
     tells = np.array(stretches)
     whole, count = tells.sum(), tells.size
