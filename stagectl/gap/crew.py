@@ -128,6 +128,10 @@ class Threads:
             self._count(-helpers_count)
         return [done[number % len(done)][number // len(done)] for number in range(len(items))]
 
+    def map(self, task: Callable[..., Result], shared: Sequence[object], items: Iterable[Item]) -> list[Result]:
+        """Return task(*shared, item) for each item."""
+        return self.here(lambda item: task(*shared, item), items)
+
     def _taken(self, most: int) -> int:
         """Take as many threads as have nothing to do, and return how many; who asks has something to do."""
         with self._lock:
@@ -138,10 +142,6 @@ class Threads:
     def _count(self, change: int) -> None:
         with self._lock:
             self._busy_count += change
-
-    def map(self, task: Callable[..., Result], shared: Sequence[object], items: Iterable[Item]) -> list[Result]:
-        """Return task(*shared, item) for each item."""
-        return self.here(lambda item: task(*shared, item), items)
 
     def __enter__(self) -> Self:
         """Hand the interpreter on sooner while the threads work: what waits for it 5 ms could compute meanwhile."""

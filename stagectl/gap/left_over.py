@@ -70,11 +70,11 @@ def unknown_rest(
         if gain > gained:
             best, gained = curve, gain
     judge.trace.append(f"left over {left:.0f} of {first:.0f}, noise {noise:.0f}, best curve {gained:.0f}")
-    left_share, curve_share, finer_share = _LEFT_SHARE, _CURVE_SHARE, _FINER_SHARE
-    if is_exact or are_exact(search, chosen):
+    is_exact_here = are_exact(search, chosen)
+    finer_share = _EXACT_CURVE_SHARE if is_exact_here else _FINER_SHARE
+    left_share, curve_share = _LEFT_SHARE, _CURVE_SHARE
+    if is_exact or is_exact_here:
         left_share, curve_share = _EXACT_LEFT_SHARE, _EXACT_CURVE_SHARE
-    if are_exact(search, chosen):
-        finer_share = _EXACT_CURVE_SHARE
     floor = _LEFT_SDS * noise + left_share * max(first, 0.0)
     least = max(CURVE_GAIN * judge.threshold, curve_share * max(first, 0.0))
     if not left > floor and not gained > least:
