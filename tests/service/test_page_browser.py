@@ -320,6 +320,34 @@ def test_missed_cycles_and_lateness_have_their_tiles_and_count_from_when_the_pag
     expect(page.locator("#discarded")).to_have_text("12,345 bytes discarded")
 
 
+def test_a_motion_that_no_status_shows_under_way_says_what_became_of_it(idle, opened):
+    """So short is a step of 1 um, or any motion in virtual time on a fast host, beside ten statuses a second."""
+    page = opened(Role.OPERATE)
+
+    def pass_on(socket):
+        def send(text):
+            message = json.loads(text)
+            message["status"]["command"] = None
+            socket.send(json.dumps(message))
+
+        socket.connect_to_server().on_message(send)
+
+    page.route_web_socket("**/v1/stream", pass_on)
+    page.reload()
+    expect(page.locator("#state")).not_to_have_attribute("data-state", "lost", timeout=PATIENCE_MS)
+    take_and_arm(page)
+    expect(page.locator("#command-text")).to_have_text("arm: done", timeout=PATIENCE_MS)
+    page.fill("#target", "3")
+    page.click("#move")
+    expect(page.locator("#command-text")).to_have_text("move: done", timeout=PATIENCE_MS)
+    press(page, "#jog-left")
+    idle.state_is("moving")
+    page.mouse.up()
+    expect(page.locator("#command-text")).to_have_text("jogging: done", timeout=PATIENCE_MS)
+    page.click("#stop")
+    state_is(page, "idle")
+
+
 def test_a_fault_says_what_to_do_and_its_acknowledgement_enables_nothing(idle, opened):
     with Client(idle.socket) as vanishing:
         vanishing.take_lease("who vanishes", duration_s=1.0)

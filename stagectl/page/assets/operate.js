@@ -77,7 +77,14 @@ export class Operator {
 
   async command(path, body, method = 'POST') {
     this.refuse('');
-    try { return await this.press(method, path, body); } catch (error) { this.refuse(error.message); return null; }
+    try { this.follow(await this.press(method, path, body)); } catch (error) { this.refuse(error.message); }
+  }
+
+  // What the service took is shown from its answer on: a motion can be over before the next status is sent.
+  follow(taken) {
+    if (!taken.key) return; // a run that was begun or ended by hand is no command with an end of its own
+    this.told = taken;
+    this.showCommand();
   }
 
   refuse(text) {
@@ -139,7 +146,11 @@ export class Operator {
     let begun = '';
     try {
       while (this.jog !== 0) {
-        begun ||= (await this.ask('POST', 'jogging', { hold_s: JOG_HOLD_S })).key;
+        if (!begun) {
+          const taken = await this.ask('POST', 'jogging', { hold_s: JOG_HOLD_S });
+          this.follow(taken);
+          begun = taken.key;
+        }
         if (this.jog !== 0 && !await this.goOn(begun, this.jog * this.speed_m_per_s())) begun = '';
         await sleep(JOG_AGAIN_MS);
       }
