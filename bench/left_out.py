@@ -132,6 +132,7 @@ def is_together(one: Marked) -> bool:
     named, truth = one.mark["named"], one.searched.truth
     if truth is None or not named:
         return False
-    keys = [(found["name"], found["acts_on"]) for found in [*named, *one.searched.findings["parameter_errors"]]]
+    told = [(found["name"], found["acts_on"], found["parameters"]) for found in named]
+    told += [(error["name"], error["acts_on"], {}) for error in one.searched.findings["parameter_errors"]]
     case = generate.draw(one.searched.seed, truth["kind"], DURATION_S)
-    return together.distance(case, keys) < detection.SEPARABLE_D
+    return together.distance(case, told) < detection.SEPARABLE_D

@@ -74,6 +74,11 @@ def test_where_the_nearest_law_leaves_less_than_the_floor_scatters_by_no_rest_is
 # ---- laws that are together another one ------------------------------------------------------------------------------
 
 
+def told(*names):
+    """Laws by name@place, nothing told of their sizes."""
+    return [(*one.split("@"), {}) for one in names]
+
+
 @pytest.fixture(scope="module")
 def tilted():
     return draw.draw(90, "single", 5.0)
@@ -82,30 +87,46 @@ def tilted():
 def test_two_offsets_are_a_tilt_and_one_is_not(tilted):
     assert [effect.law.name for effect in tilted.effects] == ["tilt"]
     alone = together.distance(tilted, [])
-    assert together.distance(tilted, [("offset", "macro_force"), ("offset", "micro_force")]) < 1e-3 * alone
-    assert detection.SEPARABLE_D < together.distance(tilted, [("offset", "macro_force")]) < alone
+    assert together.distance(tilted, told("offset@macro_force", "offset@micro_force")) < 1e-3 * alone
+    assert detection.SEPARABLE_D < together.distance(tilted, told("offset@macro_force")) < alone
 
 
 def test_a_cable_that_is_anchored_far_away_is_an_offset(tilted):
-    assert together.distance(tilted, [("offset", "macro_force"), ("cable_spring", "micro_force")]) < 0.1
+    assert together.distance(tilted, told("offset@macro_force", "cable_spring@micro_force")) < 0.1
 
 
 def test_viscous_and_coulomb_friction_are_no_drag():
     drag = draw.draw(95, "single", 5.0)
     assert [effect.law.name for effect in drag.effects] == ["quadratic_drag"]
-    two = together.distance(drag, [("viscous_friction", "macro_force"), ("coulomb_friction", "macro_force")])
-    assert detection.SEPARABLE_D < two < together.distance(drag, [("viscous_friction", "macro_force")])
+    two = together.distance(drag, told("viscous_friction@macro_force", "coulomb_friction@macro_force"))
+    assert detection.SEPARABLE_D < two < together.distance(drag, told("viscous_friction@macro_force"))
 
 
 def test_a_law_is_no_mixture_of_two_of_its_speeds(tilted):
     evidence = detection.Evidence(tilted, tilted.runs).narrowed(detection.SEPARATION_BAND_HZ)
-    for name, columns in (("stribeck_friction", {1}), ("cable_spring", {1, 2})):
-        points = together._points(evidence, name, "macro_force", tilted.effects)
-        assert {len(point.columns) for point in points} == columns
+    for name, columns_count in (("stribeck_friction", 1), ("cable_spring", 2)):
+        member = together._member(evidence, name, "macro_force", tilted.effects)
+        assert {len(member.columns(point)) for point in member.points} == {columns_count}
 
 
 def test_a_law_that_the_generator_has_not_is_infinitely_far(tilted):
-    assert together.distance(tilted, [("force_over_position", "macro_force")]) == math.inf
+    assert together.distance(tilted, told("force_over_position@macro_force")) == math.inf
+
+
+def test_a_late_reading_is_followed_to_where_it_comes_nearest_to_one_that_lags():
+    """The lag is 712 us; no delay of the grid comes nearer than 27 deviations."""
+    lag = draw.draw(232, "single", 5.0)
+    assert [effect.law.name for effect in lag.effects] == ["sensor_lag"]
+    delay = together.distance(lag, told("sensor_delay@macro_sensor"))
+    assert delay == pytest.approx(1.84, abs=0.05)
+
+
+def test_a_mode_is_followed_beyond_the_band_that_it_is_drawn_from():
+    """Beside a delay it takes of a lag of 244 us what no mode of up to 90 Hz does."""
+    lag = draw.draw(169, "single", 5.0)
+    assert [effect.law.name for effect in lag.effects] == ["sensor_lag"]
+    delay = together.distance(lag, told("sensor_delay@end_sensor"))
+    assert together.distance(lag, told("sensor_delay@end_sensor", "flexible_mode@micro_force")) < 0.85 * delay
 
 
 def test_an_answer_without_names_is_no_law_together():

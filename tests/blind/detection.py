@@ -426,7 +426,7 @@ class Evidence:
         solution = np.linalg.lstsq(gram / np.outer(scale, scale), target / scale, rcond=1e-10)[0]
         return math.sqrt(max(whole - float((target / scale) @ solution), 0.0))
 
-    def _rest_after_best_size(self, signal, at_size, size, signed):
+    def _rest_after_best_size(self, signal, law, acts_on, values):
         """Distance d of `signal` from a law whose column turns with its size: at the size that it asks for.
 
         Readings that are 20 um wrong put a body behind an edge that those which are 1 um wrong don't. Of a slope and a
@@ -435,10 +435,10 @@ class Evidence:
         far from each other what a law asks for leads nowhere: a scale error of 800 ppm asked for 742 of 946. So the
         distance itself is followed last.
         """
-        seen = []
+        first, signed, seen = law.parameters[0], law.signed, []
 
         def asks(size):
-            column = at_size(size)
+            (column,) = self.law_columns(law, acts_on, values | {first.name: size})
             whole = self.inner(column, column)
             share = self.inner(signal, column) / whole if whole > 0.0 else 0.0
             seen.append((self.rest_after(signal, [column], signed), size, size * share))
@@ -450,7 +450,7 @@ class Evidence:
 
         starts = [SLOPE_SHARE, *SIZE_STARTS, *([-start for start in SIZE_STARTS] if signed else [])]
         for start in starts:
-            asks(start * size)
+            asks(start * first.middle)
         for _ in range(SIZE_ROUNDS):
             _, _, asked = min(seen)
             if asked == 0.0 or (asked < 0.0 and not signed):
@@ -477,82 +477,77 @@ class Evidence:
     # ---- alternatives ----
 
     def alternatives(self, hints=()):
-        """Every library law at every place, over a grid of its parameters: (name, acts_on, signed, columns, at_size).
-
-        hints: effects whose pitches and frequencies join the grids of the periodic laws, and whose shape that of the
-        same law elsewhere: a drift of the macro's sensor over 36 s and one of the end's seemed 3.7 apart, as the grid
-        has 20 s and 77 s. at_size: where columns don't grow with the law's size alone, (what gives its column at a
-        size, a middle size); else None.
-        """
+        """Every library law at every place: (law, acts_on, points of its grid)."""
         for law in laws.LIBRARY:
             if self.case.single and not law.single_axis:
                 continue
             for acts_on in law.acts_on:
                 if self.case.single and acts_on.startswith(("micro", "end", "contact")):
                     continue
-                yield from self.grid(law, acts_on, hints)
+                yield law, acts_on, self.points(law, hints)
 
-    def grid(self, law, acts_on, hints):
+    def points(self, law, hints=()):
+        """Values of a law's parameters but its phase, over a grid; those of one size after those of another.
+
+        hints: effects whose pitches and frequencies join the grids of the periodic laws, and whose shape that of the
+        same law elsewhere: a drift of the macro's sensor over 36 s and one of the end's seemed 3.7 apart, as the grid
+        has 20 s and 77 s.
+        """
         first = law.parameters[0]
-        middle = math.sqrt(first.low * first.high)
         if law.name == "contact_damping" and self.case.uncertainty.get("contact_damping_n_s_per_m", 0.0) > 0.0:
-            return  # the model has one already: an error of a parameter
+            return []  # the model has one already: an error of a parameter
         if law.name == "micro_reaction" and self.case.belief["micro_reaction"] > 0.0:
-            return
-        sizes = [middle]
+            return []
+        sizes = [first.middle]
         if law.name in NONLINEAR:
             sizes = [first.low * (first.high / first.low) ** (i / 3.0) for i in range(4)]
         points = [{}]
         for parameter, count in zip(law.parameters[1:], law.grid_counts, strict=False):
-            if parameter.spread in ("phase", "run_phase"):
+            if parameter.is_phase:
                 continue
             grid = parameter.grid(count)
             if parameter.name in ("pitch_m", "frequency_hz"):
                 grid = grid + [h.values[parameter.name] for h in hints if parameter.name in h.values]
             points = [point | {parameter.name: value} for point in points for value in grid]
         for parameter in law.parameters[1:]:
-            if all(parameter.name not in point for point in points) and "phase" not in parameter.spread:
-                points = [point | {parameter.name: math.sqrt(parameter.low * parameter.high)} for point in points]
+            if all(parameter.name not in point for point in points) and not parameter.is_phase:
+                points = [point | {parameter.name: parameter.middle} for point in points]
         points += [
-            {p.name: hint.values[p.name] for p in law.parameters[1:] if "phase" not in p.spread}
+            {p.name: hint.values[p.name] for p in law.parameters[1:] if not p.is_phase}
             for hint in hints
             if hint.law.name == law.name and len(law.parameters) > 1
         ]
-        phase = next((parameter for parameter in law.parameters if "phase" in parameter.spread), None)
-        moves_edges = not self.case.single and (law.family == "sensor" or law.name in EDGE_LAWS)
-        for size in sizes:
-            for point in points:
-                values = {first.name: size} | point
-                if phase is None:
+        return [{first.name: size} | point for size in sizes for point in points]
 
-                    def at_size(size, point=point):
-                        values = {first.name: size} | point
-                        return self.whitened([self.law_channels(run, law, acts_on, values) for run in self.runs])
+    def turns_with_size(self, law):
+        """Whether a law may put a body behind an edge, so that its column turns with its size."""
+        return not self.case.single and law.phase is None and (law.family == "sensor" or law.name in EDGE_LAWS)
 
-                    sized = (at_size, middle) if moves_edges and size == sizes[0] else None
-                    yield law.name, acts_on, law.signed, [at_size(size)], sized
-                    continue
-                columns = []
-                groups = sorted({run.homing if phase.spread == "phase" else run.number for run in self.runs})
-                for turn in (0.0, 0.5 * math.pi):
-                    channels = [self.law_channels(run, law, acts_on, values | {phase.name: turn}) for run in self.runs]
-                    for group in groups:
-                        part = [
-                            own if (run.homing if phase.spread == "phase" else run.number) == group else None
-                            for run, own in zip(self.runs, channels, strict=True)
-                        ]
-                        columns.append(self.whitened(part))
-                yield law.name, acts_on, True, columns, None
+    def law_columns(self, law, acts_on, values):
+        """What a law changes, whitened; one that has a phase at two of them, for each homing or run that draws one."""
+        if law.phase is None:
+            return [self.whitened([self.law_channels(run, law, acts_on, values) for run in self.runs])]
+        columns = []
+        group_of = [run.homing if law.phase.spread == "phase" else run.number for run in self.runs]
+        for turn in (0.0, 0.5 * math.pi):
+            there = values | {law.phase.name: turn}
+            channels = [self.law_channels(run, law, acts_on, there) for run in self.runs]
+            for group in sorted(set(group_of)):
+                own = [one if its == group else None for its, one in zip(group_of, channels, strict=True)]
+                columns.append(self.whitened(own))
+        return columns
 
     def distances(self, signal, hints=()):
         """{(name, acts_on): smallest distance of `signal` from that law over its grid}, parameter errors included."""
         nearest = {}
-        for name, acts_on, signed, columns, sized in self.alternatives(hints):
-            distance = self.rest_after(signal, columns, signed)
-            if sized is not None:
-                distance = min(distance, self._rest_after_best_size(signal, *sized, signed))
-            key = (name, acts_on)
-            nearest[key] = min(nearest.get(key, math.inf), distance)
+        for law, acts_on, points in self.alternatives(hints):
+            size = law.parameters[0].name
+            for values in points:
+                columns = self.law_columns(law, acts_on, values)
+                distance = self.rest_after(signal, columns, law.signed or law.phase is not None)
+                if self.turns_with_size(law) and values[size] == points[0][size]:
+                    distance = min(distance, self._rest_after_best_size(signal, law, acts_on, values))
+                nearest[law.name, acts_on] = min(nearest.get((law.name, acts_on), math.inf), distance)
         for key, names in PARAMETER_ERRORS.items():
             if all(name in self.names for name in names):
                 nearest[key] = self.rest_after(signal, [self.parameter_column(key)], True)

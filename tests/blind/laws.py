@@ -33,6 +33,16 @@ class Parameter:
     high: float
     spread: str = "log"
 
+    @property
+    def middle(self):
+        """Geometric mean of its range."""
+        return math.sqrt(self.low * self.high)
+
+    @property
+    def is_phase(self):
+        """Whether it is drawn again at each homing, or each run."""
+        return "phase" in self.spread
+
     def drawn(self, rng):
         """One value."""
         low, high = self.low, self.high
@@ -82,6 +92,11 @@ class Law:
     def code_at(self, acts_on):
         """Its code at a place: cubic stiffness between the stages is a law of the contact."""
         return BETWEEN_CUBIC if self.code == CUBIC and acts_on == "contact" else self.code
+
+    @property
+    def phase(self):
+        """Its phase, None where it has none."""
+        return next((parameter for parameter in self.parameters if parameter.is_phase), None)
 
     def vector(self, values):
         """Parameters as the compiled code takes them."""
