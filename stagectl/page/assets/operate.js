@@ -82,7 +82,7 @@ export class Operator {
 
   // What the service took is shown from its answer on: a motion can be over before the next status is sent.
   follow(taken) {
-    if (!taken.key) return; // a run that was begun or ended by hand is no command with an end of its own
+    if (!taken?.key) return; // a run that was begun or ended by hand is no command with an end of its own
     this.told = taken;
     this.showCommand();
   }
