@@ -9,6 +9,7 @@ from stagectl.gap import balance, looks
 from stagectl.gap.aliases import aliases_of
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Serial
+from stagectl.gap.findings import Named
 from stagectl.gap.judge import ALIAS_SHARE, EXACT_RATIO, LEFT_SDS, Judge
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group
@@ -218,6 +219,22 @@ def test_no_name_is_dropped_where_forms_are_told_apart_beside_all_names(monkeypa
     again = looks._again_in(search, first, closer, [], Serial())
     assert again is not None
     assert {group.key for group in again.chosen} == {lag.key, spring.key}
+
+
+@pytest.mark.parametrize("own", [(), (("command_delay", "macro_command", 2.0),)])
+def test_forms_of_what_moves_readings_are_those_of_the_first_look_and_all_else_is_the_closer_ones(own, monkeypatch):
+    """Beside a clock that was a little off, a lag of 62 us seemed to be 8 us, and a delay of either drive as well."""
+    search = _search(_pulled_by(60.0, 0.0))
+    monkeypatch.setattr(looks, "moves_readings", lambda search, group: True)
+    lag = next(group for group in search.judge.library if group.key == ("sensor_lag", "macro_sensor"))
+    delay = ("sensor_delay", "macro_sensor", 0.5)
+    named = [
+        Named(*lag.key, parameters={}, sds={}, gain=0.0, held_out_gain=0.0, aliases=aliases)
+        for aliases in (own, (("command_delay", "micro_command", -14.0), delay))
+    ]
+    closer, first = (looks.Look(search, [lag], (one,)) for one in named)
+    (told,) = looks._with_forms_of(closer, first).named
+    assert set(told.aliases) == {*own, delay}
 
 
 def test_one_law_at_two_places_and_two_laws_at_one_are_compared_at_their_sizes(monkeypatch):

@@ -11,7 +11,7 @@ import pytest
 
 from bench.blind_sets import load_set
 from stagectl.effects import CATALOGUE
-from stagectl.gap import balance
+from stagectl.gap import balance, hypotheses
 from stagectl.gap.aliases import aliases_of
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Serial
@@ -19,7 +19,7 @@ from stagectl.gap.findings import Findings
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.recording import Recording
 from stagectl.gap.selection import select
-from stagectl.gap.settling import left_at_size
+from stagectl.gap.settling import left_at_size, settled
 from stagectl.gap.workflow import find
 from tests.blind import draw, generate, laws
 
@@ -127,6 +127,18 @@ def test_a_scale_error_leaves_the_same_as_one_of_the_other_sensor(seed, tmp_path
         one = left_at_size(recordings, noise, (moved,), (), Serial(), scales)
         scales, left = one.scales, [*left, one.squares]
     assert left[0] == pytest.approx(left[1], abs=2.0)
+
+
+def test_sizes_that_pull_at_each_other_are_followed_to_where_they_stand(tmp_path):
+    """After six passes 110 ppm of 135: what that left was an Abbe error to the search, and the set came out unknown."""
+    hidden = ("scale_error", "macro_sensor", {"relative": -1.35e-4}), ("soft_contact", "contact", {"knee_m": 23e-6})
+    recordings = _recordings(_hidden(2708, 6.0, *hidden), tmp_path)
+    noise = slow_noise(recordings[0].believed, recordings[0])
+    moved = (CATALOGUE["scale_error"], "macro_sensor", {"error_ppm": -17.0})
+    soft = hypotheses.term_at_size(CATALOGUE["soft_contact"], "contact", {"knee_m": 20e-6})
+    _, (scale,), (contact,) = settled(recordings, noise, (moved,), (soft,))
+    assert scale[2]["error_ppm"] == pytest.approx(-135.0, rel=0.03)
+    assert contact.shape["knee_m"] == pytest.approx(23e-6, rel=0.03)
 
 
 def test_a_tilt_beside_a_cable_is_an_offset_of_the_micro_and_a_cable_anchored_elsewhere(tmp_path):

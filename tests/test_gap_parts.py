@@ -170,6 +170,18 @@ def test_a_law_about_a_place_is_no_wider_than_one_about_zero(wider, is_alias):
     assert ((wider, place) in [key for key, _ in aliases_of(judge, [spring], spring)]) is is_alias
 
 
+@pytest.mark.parametrize(("wider", "is_alias"), [("thermal_drift", True), ("abbe_error", False)])
+def test_a_drift_of_a_sensor_is_an_alias_of_a_shift_of_the_joint(wider, is_alias):
+    """None is a case of the other, and which of them moved is not to be told from as little as the end of a drift."""
+    judge = _judge(0.3)
+    shift, other = (
+        Group(("backlash_centre_shift", "contact_edge"), (3,)),
+        Group((wider, "end_sensor"), (4,), searched=1),
+    )
+    judge.library[1:3] = shift, other
+    assert (other.key in [key for key, _ in aliases_of(judge, [shift], shift)]) is is_alias
+
+
 def test_names_are_as_far_apart_as_what_they_say():
     """Twins with a correlation of 0.999, 33 long: 33^2 (1 - 0.999^2) is 2; another term has nothing in common."""
     judge = _judge(0.3)
@@ -230,6 +242,19 @@ def test_what_is_known_keeps_names_apart_that_motion_does_not():
     base, mass = Group(("force_constant", "parameter"), (1,), prior_sds=(0.1,)), Group(("mass", "parameter"), (2,))
     judge = _table_judge(draw, [mass], base=[base])
     assert judge.distance([mass], []) == pytest.approx(100.0, rel=0.1)
+
+
+def test_what_sessions_explain_by_themselves_leaves_nothing_open_and_not_less():
+    """By rounding less than nothing was left of it, and a search ended with an error of algebra."""
+
+    def draw(run, random):
+        force, other, third = random.standard_normal((3, 1000))
+        nearly = [force + 1e-3 * other, force - 1e-3 * other, force + 1e-5 * third]
+        return [random.standard_normal(1000) + force, force, *nearly, other]
+
+    own = [Group(("own", "macro_force"), (column,), "session") for column in (2, 3, 4)]
+    whole = [Group(("whole", "macro_force"), (column,)) for column in (1, 5)]
+    assert np.isfinite(_table_judge(draw, whole, base=own).gains(whole)).all()
 
 
 def test_what_training_leaves_open_does_not_speak_against_the_truth():
@@ -379,6 +404,24 @@ def test_what_rises_on_a_level_is_reshaped_with_the_level():
     assert judge.gain([compromise, level]) - judge.gain([compromise]) > 35.0
     assert not judge.stays([compromise], level)
     assert select(judge) == [rise, level]
+
+
+def test_a_small_name_competes_with_the_shapes_that_it_would_have_beside_it():
+    """Beside an exponent that has taken two thirds of a viscous friction a drag gains twice as much as that is left."""
+
+    def draw(run, random):
+        bend, viscous, other, rest = (random.standard_normal(4000) for _ in range(4))
+        compromise = bend + 0.04 * viscous + 0.02 * other + 0.02 * rest
+        hidden = 5.0 * bend + 0.3 * viscous
+        return [random.standard_normal(4000) + hidden, compromise, bend, viscous, viscous - other]
+
+    place = "micro_force"
+    compromise, bend = (Group(("sublinear_viscous_friction", place), (column,), searched=1) for column in (1, 2))
+    viscous, drag = Group(("viscous_friction", place), (3,)), Group(("quadratic_drag", place), (4,))
+    judge = _table_judge(draw, [compromise, viscous, drag])
+    judge.refine = lambda beside, groups: [bend if viscous in beside and g is compromise else g for g in groups]
+    assert judge.gain([compromise, drag]) > judge.gain([compromise, viscous]) + 50.0
+    assert select(judge) == [bend, viscous]
 
 
 @pytest.mark.parametrize(

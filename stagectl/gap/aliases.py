@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stagectl.gap.judge import ALIAS_GAIN, ALIAS_SHARE, Judge
-from stagectl.gap.kinds import form, shows_at_low_speed
+from stagectl.gap.kinds import form, is_joint_against_zeros, shows_at_low_speed
 from stagectl.gap.normal_equations import Group
 
 BETWEEN_SDS = 3.0
@@ -33,7 +33,8 @@ def aliases_of(judge: Judge, chosen: Sequence[Group], group: Group) -> list[tupl
     taken = {other.key for other in chosen}
     anchors = [moved for moved in judge.anchors_moved(chosen, group) if moved.key not in taken]
     for rival in judge.rivals(rest):
-        if rival.key in taken or form(rival) > form(group):
+        is_wider = form(rival) > form(group) and not is_joint_against_zeros(rival, group)
+        if rival.key in taken or is_wider:
             continue
         beside = [*rest, *(moved for moved in anchors if moved.key != rival.key)]
         forms = [one for one in judge.brought_near(rival, group) if judge.allows([*beside, one])]

@@ -219,7 +219,10 @@ def _foretelling(solution: Solution, fixed: Sequence[int], elsewhere: np.ndarray
     scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
     scale[scale == 0.0] = 1.0  # nothing is known of it
     weights = np.outer(scale, scale)
-    _, sums = eigh(elsewhere / weights, normal / weights + _JITTER * np.eye(scale.size))
+    known, directions = np.linalg.eigh(normal / weights)
+    # by rounding less than nothing may be known of what amplitudes of their own explain
+    metric = (directions * np.maximum(known, _JITTER)) @ directions.T
+    _, sums = eigh(elsewhere / weights, metric)
     sizes = sums.T @ (normal / weights) @ (solution.values[list(fixed)] * scale)
     return sums @ np.where(np.abs(sizes) > OPEN_SDS, sizes, 0.0) / scale
 
