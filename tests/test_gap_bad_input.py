@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from bench.blind_sets import load_set
 from stagectl import cli
 from stagectl.backend import BatchBackend
 from stagectl.errors import RecordError, RequestError
@@ -17,6 +18,7 @@ from stagectl.record import read_run
 from stagectl.requests import TICKING
 from stagectl.supervisor import Supervisor
 from stagectl.table_import import import_table
+from tests.blind import generate
 from tests.gap_tables import AXIS_MAP, STAGE_MAP, axis_table, profile_file, stage_table, write_csv
 
 WOBBLE_M = 12e-6
@@ -318,3 +320,13 @@ def test_a_micro_that_pushes_the_macro_back_is_a_missing_effect_and_no_other_mac
     for one in (believed, unsaid):
         with pytest.raises(RequestError, match=r"profile of another machine|is this machine.s profile"):
             plausibility.check_recordings(one, [recording_of(heavier, one)])
+
+
+def test_beside_a_cogging_a_push_of_the_micro_is_still_no_other_machine(tmp_path):
+    """A mass of 42 % more made up for some of the cogging, too, and left half of what the push that there was did."""
+    generate.write(generate.draw(2939, "multi", 8.0), tmp_path)
+    blind = load_set(tmp_path)
+    plausibility.check_recordings(blind.believed, [recording_of(log, blind.believed) for log in blind.logs])
+    heavier = [dataclasses.replace(log, macro_command_n=2.0 * log.macro_command_n) for log in blind.logs]
+    with pytest.raises(RequestError, match=r"profile of another machine|is this machine.s profile"):
+        plausibility.check_recordings(blind.believed, [recording_of(log, blind.believed) for log in heavier])

@@ -23,7 +23,7 @@ from stagectl.gap.normal_equations import Group, solve
 from stagectl.gap.operating_point import operating_point, with_joint_changed
 from stagectl.gap.quantities import AT_READING, AT_READING_SD, quantities
 from stagectl.gap.recording import Recording
-from stagectl.gap.refinement import Refiner
+from stagectl.gap.refinement import Refiner, reach_of
 from stagectl.gap.reversals import since_reversal
 from stagectl.gap.settling import settled_by
 
@@ -398,3 +398,11 @@ def test_an_error_that_is_known_is_taken_out_where_the_body_is_known_better(fore
     np.testing.assert_array_equal(place_m, motion.known_m[moves] if by_sample else motion.at_samples[moves, 0])
     np.testing.assert_array_equal(sd_m, 0.4e-9 if by_sample else foretold_sd_m)
     np.testing.assert_array_equal(there["position_m"][:, 0], motion.at_samples[:, 0])
+
+
+@pytest.mark.parametrize(("pitch_m", "most_m"), [(0.02, 0.026), (0.035, 0.04), (0.05, 0.05)])
+def test_no_pitch_becomes_longer_than_the_way(pitch_m, most_m):
+    """Over 40 mm: what does not repeat there is a bend: a longer one made a cubic stiffness of a spring."""
+    recording = balance.recording_of(_axis_log(_swing(T_S)), AXIS)
+    term = hypotheses.term_of(CATALOGUE["cogging"], "macro_force", {"pitch_m": pitch_m})
+    assert reach_of([recording], term, "pitch_m", 1.0)[1] == pytest.approx(most_m, rel=0.01)

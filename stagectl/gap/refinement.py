@@ -431,7 +431,8 @@ def reach_of(recordings: Sequence[Recording], term: Term, name: str, narrow: flo
     if name == "pitch_m":
         span = max(float(np.ptp(r.position_m(_axis(term)))) for r in recordings)
         reach = narrow * _PITCH_SPANS * at * at / span
-        return max(low, at - reach), min(high, at + reach)
+        # a spring less a cogging of 1 m was a cubic stiffness over 0.32 m: nobody has seen that repeat
+        return max(low, at - reach), max(at, min(high, at + reach, span))
     if name == effect.period == "frequency_hz":
         reach = narrow * 0.5 / max(r.log.samples_count * r.log.period_s for r in recordings)
         return max(low, at - reach), min(high, at + reach)
