@@ -9,6 +9,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 from bench import emps_figures, final_seeds, left_out, suite_figures
 from bench.blind_sets import (
@@ -45,6 +46,7 @@ PART_LEFT_OUT_COUNT = 4
 LEFT_OUT_S = 100.0  # kept back of a part run's time for them
 FULL_COUNT = 300  # drawn as the shares of the suite have it; then sets with nothing missing until there are so many:
 FULL_NULLS_COUNT = 150
+FULL_SINGLES_COUNT = 150  # drawn besides, for the library without one effect
 SPEED_SEED = 7006  # it draws four runs of both axes
 _SPEED_RUNS_COUNT = 4
 _SPEED_WORKERS_COUNT = 2
@@ -116,7 +118,7 @@ def _part(say: Say, until_s: float) -> Iterator[Figure]:
     jobs = [Job(seed, None, sets_folder()) for seed in PART_SEEDS]
     found = _marked(searched(jobs, workers, until_s - LEFT_OUT_S), say)
     yield from suite_figures.suite(found, full=False)
-    yield from left_out.figures(found, False, say, PART_LEFT_OUT_COUNT, until_s)
+    yield from left_out.figures(_truths(found), False, say, PART_LEFT_OUT_COUNT, until_s)
     yield from suite_figures.effect_by_effect(found)
 
 
@@ -133,9 +135,11 @@ def _full(say: Say) -> Iterator[Figure]:
         seeds = range(end, end := end + missing)
         _search_all([Job(seed, "null", sets_folder(), keep=False) for seed in seeds], run, done, say)
     found = [marked(done[seed]) for seed in sorted(done)]
+    say(f"{FULL_SINGLES_COUNT} more sets with one effect are drawn: of each law one may show better that it is missing")
+    more = left_out.drawn_truths(range(end, end + FULL_SINGLES_COUNT))
     measured = [
         *suite_figures.suite(found, full=True),
-        *left_out.figures(found, True, say, None, float("inf")),
+        *left_out.figures([*_truths(found), *more], True, say, None, float("inf")),
         *suite_figures.effect_by_effect(found),
     ]
     run.end(done, measured, time.monotonic() - begin_s)
@@ -148,6 +152,10 @@ def _search_all(jobs: Sequence[Job], run: final_seeds.FinalRun, done: dict[int, 
         run.keep(one)
         done[one.seed] = one
         say(line(marked(one)))
+
+
+def _truths(found: Iterable[Marked]) -> list[dict[str, Any]]:
+    return [one.searched.truth for one in found if one.searched.truth is not None]
 
 
 def _is_null(one: Searched) -> bool:

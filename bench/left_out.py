@@ -1,12 +1,16 @@
-"""The library without one of its effects: every effect in its turn, on a set that hides it alone.
+"""The library without one of its effects: every effect in its turn, on the set that hides it alone and shows it best.
 
 Right is "unknown", or what nobody can tell from the hidden law: an alias of it, a law that holds it as a special case,
 or laws that are together what it is, by the generator's own measure.
 """
 
 import itertools
+import json
+import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any
 
 from bench import suite_figures
 from bench.blind_names import our_keys
@@ -36,29 +40,40 @@ def without(name: str, acts_on: str) -> frozenset[str]:
     return frozenset(key[0] for key in our_keys(name, acts_on))
 
 
-def farthest_singles(found: Sequence[Marked]) -> dict[str, tuple[float, int, str]]:
+def farthest_singles(truths: Iterable[dict[str, Any]]) -> dict[str, tuple[float, int, str]]:
     """Return (distance to the nearest other law, seed, place) of the single of every effect that is farthest from it.
 
     What another law does as well, but for less than the floor scatters by, nobody calls unknown who has no law for it:
     a sensor's delay of 283 deviations was a lag but for 86 squares, where the floor of a set scatters by 630 to 880.
     """
     farthest: dict[str, tuple[float, int, str]] = {}
-    for one in found:
-        truth = one.searched.truth
-        if truth is not None and one.mark["category"] == "single":
-            (member,) = truth["effects"]
-            own = member["nearest"][0][2], one.searched.seed, member["acts_on"]
+    for truth in truths:
+        if truth["kind"] != "single":
+            continue
+        (member,) = truth["effects"]
+        if member["above_twice_limit"]:
+            own = member["nearest"][0][2], truth["seed"], member["acts_on"]
             farthest[member["name"]] = max(farthest.get(member["name"], own), own)
     return farthest
 
 
+def drawn_truths(seeds: Iterable[int]) -> list[dict[str, Any]]:
+    """Return the truths of further sets that hide one effect each, of which nothing has been searched."""
+    with ProcessPoolExecutor(os.cpu_count() or 1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return list(pool.map(_drawn_truth, seeds))
+
+
+def _drawn_truth(seed: int) -> dict[str, Any]:
+    return json.loads(json.dumps(generate.truth(generate.draw(seed, "single", DURATION_S))))
+
+
 def figures(
-    found: Sequence[Marked], full: bool, say: Callable[[str], None], most: int | None, until_s: float
+    truths: Iterable[dict[str, Any]], full: bool, say: Callable[[str], None], most: int | None, until_s: float
 ) -> Iterator[Figure]:
-    """Search the set of every effect again that no other law comes near, with a library that lacks the effect."""
+    """Search the set of every effect that no other law comes near, with a library that lacks the effect."""
     jobs = [
-        Job(seed, None, sets_folder(), keep=not full, options=(("without", without(name, acts_on)),))
-        for name, (_, seed, acts_on) in list(farthest_singles(found).items())[:most]
+        Job(seed, "single", sets_folder(), keep=not full, options=(("without", without(name, acts_on)),))
+        for name, (_, seed, acts_on) in list(farthest_singles(truths).items())[:most]
     ]
     say(f"the library without one effect, {len(jobs)} times")
     again, right = [], []

@@ -45,7 +45,10 @@ def test_an_effect_is_left_out_of_the_set_that_no_other_law_comes_near():
         one(5, "multi", [found()], member("offset"), member("tilt")),
         one(6, "null"),
     ]
-    assert farthest_singles(sets) == {
+    below = single(7, "offset", [])
+    below.searched.truth["effects"][0]["above_twice_limit"] = False
+    truths = [marked.searched.truth for marked in [*sets, below]]
+    assert farthest_singles(truths) == {
         "sensor_delay": (38.3, 2, "macro_force"),
         "coulomb_friction": (12.0, 4, "macro_force"),
     }
