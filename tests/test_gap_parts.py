@@ -298,6 +298,22 @@ def test_the_floor_scatters_by_what_its_noise_is_known_to():
     assert np.var((z * z).sum(axis=1) / noise) == pytest.approx(FLOOR_VARIANCE * 1000, rel=0.1)
 
 
+@pytest.mark.parametrize(("beside", "is_found"), [("parameter", True), ("macro_force", False)])
+def test_a_second_wrong_parameter_is_one_by_what_parameters_gain_on_noise(beside, is_found):
+    """Beside an effect, whose law may be inexact, it is one by what the best of the whole library gains on noise."""
+
+    def draw(run, random):
+        large, small = random.standard_normal((2, 4000))
+        return [random.standard_normal(4000) + 0.2 * large + 0.054 * small, large, small]
+
+    first, second = Group(("first", beside), (1,)), Group(("second", "parameter"), (2,))
+    judge = _table_judge(draw, [first, second])
+    judge.threshold = 35.0
+    gained = judge.gain([first, second]) - judge.gain([first])
+    assert 15.0 < gained < 30.0
+    assert judge.stays([first], second) is is_found
+
+
 @pytest.mark.parametrize(("training", "runs"), [(2, 3), (3, 3)])
 def test_what_training_leaves_open_is_not_foretold_of_recordings_that_no_fit_saw(training, runs):
     """An error of a reading, by a soft spring to a tenth of the noise, and by a contact to a thousand times that."""

@@ -353,7 +353,7 @@ class Judge:
         """
         if group.key[1] != "parameter":
             return NAMING_RATIO * self.threshold + SEARCH_PRICE * group.searched
-        is_alone = not chosen and not self.at_size
+        is_alone = not self.at_size and all(other.key[1] == "parameter" for other in chosen)
         return self._threshold_of_parameters() if is_alone else self.threshold
 
     def _threshold_of_parameters(self) -> float:
