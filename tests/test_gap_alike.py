@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from stagectl.effects import CATALOGUE
 from stagectl.gap import balance, looks
 from stagectl.gap.aliases import aliases_of
 from stagectl.gap.competition import Competition
@@ -235,6 +236,23 @@ def test_forms_of_what_moves_readings_are_those_of_the_first_look_and_all_else_i
     closer, first = (looks.Look(search, [lag], (one,)) for one in named)
     (told,) = looks._with_forms_of(closer, first).named
     assert set(told.aliases) == {*own, delay}
+
+
+@pytest.mark.parametrize(
+    ("told", "form", "size"),
+    [
+        (("scale_error", "end_sensor", "error_ppm", 134.0), ("scale_error", "macro_sensor"), -134.0),
+        (("scale_error", "end_sensor", "error_ppm", 134.0), ("abbe_error", "end_sensor"), -1e-6),
+        (("sensor_delay", "end_sensor", "delay_s", 2e-4), ("sensor_lag", "end_sensor"), -2e-4),
+    ],
+)
+def test_a_form_begins_with_the_size_of_the_other_where_both_are_the_same_number(told, form, size):
+    """An Abbe error that began with the ppm of a scale error as its bow in 1/m would have lost by that alone."""
+    name, place, parameter, found = told
+    closer = looks.Look(None, [], (Named(name, place, {parameter: found}, {}, 0.0, 0.0, ()),))  # pyright: ignore[reportArgumentType]
+    law = CATALOGUE[form[0]]
+    _, _, values = looks._as_large_as(closer, (law, form[1], {law.parameters[0]: -1e-6}), (name, place))
+    assert values[law.parameters[0]] == size
 
 
 def test_one_law_at_two_places_and_two_laws_at_one_are_compared_at_their_sizes(monkeypatch):

@@ -133,19 +133,18 @@ def _late_in_another_way(look: Look) -> Look | None:
     """
     search = look.search
     for k, group in enumerate(look.chosen):
-        if not (moves_readings(search, group) and _is_late(group)):
+        if not (moves_readings(search, group) and _are_late(group.key[0])):
             continue
         rest = [*look.chosen[:k], *look.chosen[k + 1 :]]
         for other in search.judge.rivals(rest):
-            if _is_late(other) and other.key[1] == group.key[1] and other.key != group.key:
+            if _are_late(other.key[0]) and other.key[1] == group.key[1] and other.key != group.key:
                 chosen = [*look.chosen[:k], other, *look.chosen[k + 1 :]]
                 return Look(search, chosen, all_named(search, chosen))
     return None
 
 
-def _is_late(group: Group) -> bool:
-    known = CATALOGUE.get(group.key[0])
-    return known is not None and Trait.LATE_READING in known.traits
+def _are_late(*names: str) -> bool:
+    return all(name in CATALOGUE and Trait.LATE_READING in CATALOGUE[name].traits for name in names)
 
 
 def _has_reached_floor(plain: Look, look: Look, rest: dict[str, Any]) -> bool:
@@ -458,14 +457,16 @@ def _left_under(
 
 
 def _as_large_as(closer: Look, one: Moved, instead_of: tuple[str, str]) -> Moved:
-    """Return an effect as large as a closer look has it, or has the one in whose place it stands."""
+    """Return an effect as large as a closer look has it, or has the one in whose place it stands by the same number."""
     effect, place, values = one
     sizes = {
         (told.name, told.acts_on): told.parameters[CATALOGUE[told.name].parameters[0]]
         for told in closer.named
         if CATALOGUE[told.name].parameters[0] in told.parameters
     }
-    size = sizes.get((effect.name, place), sizes.get(instead_of))
+    size = sizes.get((effect.name, place))
+    if size is None and (effect.name == instead_of[0] or _are_late(effect.name, instead_of[0])):
+        size = sizes.get(instead_of)
     first = effect.parameters[0]
     return one if size is None else (effect, place, {**values, first: float(np.copysign(size, values[first]))})
 
