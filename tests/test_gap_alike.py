@@ -1,6 +1,7 @@
 """Laws that are nearly alike: the simpler one where recordings can't tell them apart, and only there."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -236,6 +237,26 @@ def test_forms_of_what_moves_readings_are_those_of_the_first_look_and_all_else_i
     closer, first = (looks.Look(search, [lag], (one,)) for one in named)
     (told,) = looks._with_forms_of(closer, first).named
     assert set(told.aliases) == {*own, delay}
+
+
+@pytest.mark.parametrize(("left", "are_alike"), [(0.0, True), (1000.0, False)])
+def test_what_a_closer_look_can_t_tell_apart_is_compared_at_its_size_too(left, are_alike, monkeypatch):
+    """Of a scale error of 384 ppm the first look saw 30, and an Abbe error as its alias, not the other sensor's."""
+    search = _search(_pulled_by(60.0, 0.0))
+    monkeypatch.setattr(looks, "moves_readings", lambda search, group: True)
+    monkeypatch.setattr(looks, "is_of_readings", lambda place: True)
+    spring = _of_library(search, "linear_stiffness")
+    alone = Named(*spring.key, parameters={}, sds={}, gain=0.0, held_out_gain=0.0, aliases=())
+    closer = replace(alone, aliases=(("cubic_stiffness", "macro_force", 0.5),))
+
+    def left_under(search: Competition, models: list[list[Group]], *_: object) -> list[Left]:
+        return [Left(0.0 if model[-1].key == spring.key else left, 16_000, {}) for model in models]
+
+    monkeypatch.setattr(looks, "_left_under", left_under)
+    monkeypatch.setattr(looks, "all_named", lambda *_: (alone,))
+    first, other = looks.Look(search, [spring], (alone,)), looks.Look(search, [spring], (closer,))
+    (told,) = looks._of_best_form(first, [], Serial(), other).named
+    assert told.aliases == (closer.aliases if are_alike else ())
 
 
 @pytest.mark.parametrize(

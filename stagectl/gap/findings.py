@@ -9,6 +9,10 @@ SIGMAS = 1.96
 """So many of any deviation that is stated here are the half width of a 95 % interval."""
 
 
+Alias = tuple[str, str, float]
+"""An effect that would do as well: name, place, and the squares that it leaves more."""
+
+
 def title_of(name: str, acts_on: str) -> str:
     """Say what a finding is about."""
     return f"{name} (known parameter)" if acts_on == PARAMETER else f"{name} on {acts_on}"
@@ -24,7 +28,7 @@ class Named:
     sds: dict[str, float]
     gain: float
     held_out_gain: float
-    aliases: tuple[tuple[str, str, float], ...]
+    aliases: tuple[Alias, ...]
     confirmed: bool = False
     common_sd_ratio: float = 0.0  # what all of `sds` hold in common: of the scale of forces; 0 in older findings
     correlations: tuple[tuple[str, str, float], ...] = ()  # of the errors of pairs of `sds`; none in older findings

@@ -14,7 +14,7 @@ from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Crew
 from stagectl.gap.curvature import at_best_shapes
-from stagectl.gap.findings import Named
+from stagectl.gap.findings import Alias, Named
 from stagectl.gap.innovations import Noise
 from stagectl.gap.judge import ALIAS_GAIN, LEFT_SDS, Judge
 from stagectl.gap.kinds import form
@@ -300,7 +300,9 @@ def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew, closer
         now = search.judge.gain(chosen)
         gained = now - search.judge.gain(rest)
         least = now - max(ALIAS_GAIN, _FORMS_RATIO * gained)
-        stated = {alias[:2] for one in named if (one.name, one.acts_on) == group.key for alias in one.aliases}
+        told_closer = () if closer is None else _aliases_in_readings(closer, group.key)
+        own = (alias for one in named if (one.name, one.acts_on) == group.key for alias in one.aliases)
+        stated = {alias[:2] for alias in (*own, *told_closer)}
         others = [other for other in search.judge.rivals(rest) if _is_other_form(search, group, other, stated)]
         forms = [
             group,
@@ -316,7 +318,9 @@ def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew, closer
             if more.squares - left[best].squares > ALIAS_GAIN + _AT_SIZE_RATIO * gained + _scatter(more, left[best])
         }
         chosen[k] = forms[best]
-        named = (*(one for one in named if (one.name, one.acts_on) != group.key), *_named_as(look, chosen, k, gone))
+        also = [alias for alias in told_closer if not best and alias[:2] in {one.key for one in forms}]
+        told = _named_as(look, chosen, k, gone, also)
+        named = (*(one for one in named if (one.name, one.acts_on) != group.key), *told)
     return Look(search, chosen, named)
 
 
@@ -398,6 +402,11 @@ def _told_in(first: Competition, start: Sequence[Group], keys: Collection[tuple[
     return Look(first, chosen, all_named(first, chosen))
 
 
+def _aliases_in_readings(look: Look, key: tuple[str, str]) -> tuple[Alias, ...]:
+    found = (alias for one in look.named if (one.name, one.acts_on) == key for alias in one.aliases)
+    return tuple(alias for alias in found if is_of_readings(alias[1]))
+
+
 def _with_forms_of(look: Look, other: Look) -> Look:
     """Return a look in which what moves readings has the forms that it has in another look of the same names.
 
@@ -405,23 +414,29 @@ def _with_forms_of(look: Look, other: Look) -> Look:
     62 us was 8 us and no other than a delay of either drive.
     """
     moving = {group.key for group in other.chosen if moves_readings(other.search, group)}
-    forms = {(one.name, one.acts_on): one.aliases for one in other.named if (one.name, one.acts_on) in moving}
     named = []
     for one in look.named:
         own = [alias for alias in one.aliases if not is_of_readings(alias[1])]
-        there = [alias for alias in forms.get((one.name, one.acts_on), ()) if is_of_readings(alias[1])]
+        there = _aliases_in_readings(other, (one.name, one.acts_on))
         told = tuple(sorted([*own, *there], key=lambda alias: alias[2]))
-        named.append(replace(one, aliases=told) if (one.name, one.acts_on) in forms else one)
+        named.append(replace(one, aliases=told) if (one.name, one.acts_on) in moving else one)
     return look._replace(named=tuple(named))
 
 
-def _named_as(look: Look, chosen: list[Group], k: int, gone: set[tuple[str, str]]) -> tuple[Named, ...]:
-    """Return one of `chosen` in words, without the aliases that are `gone`."""
+def _named_as(
+    look: Look, chosen: list[Group], k: int, gone: set[tuple[str, str]], also: Sequence[Alias]
+) -> tuple[Named, ...]:
+    """Return one of `chosen` in words, with what is its alias elsewhere `also`, without the aliases that are `gone`."""
     return tuple(
-        replace(one, aliases=tuple(alias for alias in one.aliases if alias[:2] not in gone))
+        replace(one, aliases=tuple(alias for alias in _in_either(one.aliases, also) if alias[:2] not in gone))
         for one in all_named(look.search, chosen)
         if (one.name, one.acts_on) == chosen[k].key
     )
+
+
+def _in_either(own: Sequence[Alias], also: Sequence[Alias]) -> tuple[Alias, ...]:
+    known = {alias[:2] for alias in own}
+    return (*own, *(alias for alias in also if alias[:2] not in known))
 
 
 def _left_under(
