@@ -23,6 +23,8 @@ def test_unknown_an_alias_or_a_law_that_holds_it_is_right():
     elsewhere = found("tilt", aliases=[("offset", "micro_force")])
     assert not is_right(one(1, "single", [elsewhere, found("coulomb_friction")], asymmetric))
     assert not is_right(one(1, "single", [found("coulomb_friction")], asymmetric))
+    beside_a_third = [found("offset"), found("coulomb_friction"), found("tilt")]
+    assert not is_right(one(1, "single", beside_a_third, asymmetric))
     assert is_right(one(1, "single", [found("lugre_friction")], member("stribeck_friction")))
     assert not is_right(one(1, "single", [found("stribeck_friction")], member("lugre_friction")))
 

@@ -97,13 +97,17 @@ def _respelled(findings, members):
         ]
         if one and {("coulomb_friction", axis), ("offset", axis)} <= present:
             result.remove(one[0])
-            result += [{"name": name, "acts_on": axis} for name in ("coulomb_friction", "offset")]
+            result += [_respelled_as(name, axis) for name in ("coulomb_friction", "offset")]
         elif {found["name"] for found in two} == {"coulomb_friction", "offset"} and (
             ("asymmetric_coulomb_friction", axis) in present
         ):
             result = [found for found in result if not any(found is other for other in two)]
-            result.append({"name": "asymmetric_coulomb_friction", "acts_on": axis})
+            result.append(_respelled_as("asymmetric_coulomb_friction", axis))
     return result
+
+
+def _respelled_as(name, axis):
+    return {"name": name, "acts_on": axis, "alias_set": [], "parameters": {}}
 
 
 def score(findings, truth):
