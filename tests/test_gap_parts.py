@@ -11,7 +11,7 @@ from scipy import signal
 from bench.blind_sets import load_set
 from stagectl.effects import CATALOGUE
 from stagectl.errors import RecordError, RequestError
-from stagectl.gap import balance, hypotheses, innovations
+from stagectl.gap import balance, hypotheses, innovations, left_over
 from stagectl.gap.aliases import aliases_of
 from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.command_path import PARTS_COUNT
@@ -645,6 +645,21 @@ def test_what_twelve_knots_do_not_find_a_finer_curve_does(hidden, over):
     assert max(gained) < LEAST_SQUARES
     found = finer_curve(search, [friction], LEAST_SQUARES)
     assert (found and found.key) == over, search.judge.trace
+
+
+@pytest.mark.parametrize(("late", "is_alone"), [((0.0, 0.82, 0.0), True), ((0.82, 0.82, 0.82), False)])
+def test_what_one_recording_alone_has_is_a_rest_only_where_it_is_more(late, is_alone, monkeypatch):
+    """Of 41 and 48 squares that the motor's past found beside right names, one recording had nearly all (1004107)."""
+    logs = [_axis_log(f"run {seed}", 0.0, seed, late_ratio=ratio) for seed, ratio in enumerate(late, 1)]
+    recordings = [balance.recording_of(log, _believed()) for log in logs]
+    search = Competition(recordings, 3, noise=noise_of(recordings))
+    rest = ("curve over motor_force_ago_s", "macro_actuator")
+    found = finer_curve(search, [], 0.0)
+    assert found is not None, search.judge.trace
+    assert found.key == rest
+    monkeypatch.setattr(left_over, "_ALONE_RATIO", np.inf)
+    found = finer_curve(search, [], 0.0)
+    assert (found is None or found.key != rest) == is_alone
 
 
 def test_edges_that_wear_are_a_curve_over_time_beside_a_wider_gap(tmp_path):

@@ -9,7 +9,7 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap.competition import Competition
 from stagectl.gap.curves import unit_of
 from stagectl.gap.judge import ALIAS_GAIN, CURVE_GAIN, MATERIAL_RATIO, Judge
-from stagectl.gap.normal_equations import Group, solve
+from stagectl.gap.normal_equations import Fold, Group, solve
 
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
@@ -29,6 +29,14 @@ _FINER_TAIL = 1e-6
 """How seldom a finer curve finds as much on noise as makes it a rest. Beside the right names of 13 sets none found that
 much but 60 squares (51 is so much) beside 1.4 million, where 700 are material; beside five names in the place of a
 clock of 6000 squares, what is late found 46, where noise gives 40 so seldom."""
+
+_SHARED_TAIL = 0.01
+"""The same of all recordings but one, for what is not a single one's."""
+
+_ALONE_RATIO = 2.0
+"""So many times as much makes a rest of what a single recording has: beside the right names of 2 of 61 sets the past of
+a motor's force found 41 and 48 squares (40 is what noise gives so seldom), of which one recording had 33 and 115, the
+others 3 to 11 each, and 7 and 8 together."""
 
 _CROWD_COUNT = 3
 """So many names on one body that a single curve does as well as are one effect that has no name: a spring with a dead
@@ -108,9 +116,23 @@ def finer_curve(search: Competition, chosen: list[Group], material: float) -> Gr
     for curve in search.finer_curves():
         gained = search.judge.gain([*chosen, curve]) - now
         search.judge.trace.append(f"{search.term(curve).name}, finer, on {curve.key[1]} finds {gained:.0f}")
-        if gained > max(material, chi2.isf(_FINER_TAIL, len(curve.columns))):
+        by_noise = float(chi2.isf(_FINER_TAIL, len(curve.columns)))
+        if gained > max(material, by_noise) and (
+            gained > _ALONE_RATIO * by_noise or not _is_in_one_alone(search, chosen, curve)
+        ):
             found.append((gained, curve))
     return max(found, key=lambda one: one[0])[1] if found else None
+
+
+def _is_in_one_alone(search: Competition, chosen: list[Group], curve: Group) -> bool:
+    """Tell whether a curve finds something in one of several recordings, and in the others what it finds on noise."""
+    sums = search.evidence.sums
+    if len(sums) == 1:
+        return False
+    beside = [*search.judge.base, *chosen]
+    without_one = [[*sums[:k], *sums[k + 1 :]] for k in range(len(sums))]
+    found = [float(Fold(beside, others, on_noise=False).added(curve)[0]) for others in without_one]
+    return min(found) < float(chi2.isf(_SHARED_TAIL, len(curve.columns)))
 
 
 def one_curve_for_many(judge: Judge, chosen: list[Group]) -> tuple[list[Group], Group | None]:

@@ -8,6 +8,7 @@ from stagectl import compose
 from stagectl.effects import Effect
 from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.contact import side_stiffness_n_per_m
+from stagectl.gap.motion import way_per_s
 from stagectl.gap.recording import Recording, relative_motion
 
 
@@ -23,19 +24,21 @@ def quantities(recording: Recording, axis: str, place: str) -> dict[str, np.ndar
 def arguments_of(recording: Recording, axis: str, place: str, effect: Effect) -> list[np.ndarray]:
     """Return what an effect asks for, in its order; nothing else is made: recordings that are late live for one law."""
     known, made = _known(recording, axis, place)
-    names = [
-        _QUIET if name == "velocity_m_per_s" and effect.memory and _QUIET in made else name
-        for name in effect.quantities
-    ]
+    names = list(effect.quantities)
+    if effect.memory:
+        names = [_QUIET[name] if _QUIET.get(name) in made else name for name in names]
     for name in names:
         if name not in known:
             known[name] = made[name]()
     return [known[name] for name in names]
 
 
-_QUIET = "quiet_m_per_s"
+_QUIET_VELOCITY, _QUIET_CLOSING = "quiet_m_per_s", "quiet_penetration_m_per_s"
+_QUIET = {"velocity_m_per_s": _QUIET_VELOCITY, "penetration_velocity_m_per_s": _QUIET_CLOSING}
 """What a law with a memory is given for its velocity: bristles lose what they hold by the amount of the way that they
-are moved, and where a stage sticks that of the noise is larger than all of it (3.1 um in half a second, of 0.2)."""
+are moved, and where a stage sticks that of the noise is larger than all of it (3.1 um in half a second, of 0.2). A
+contact that is held is turned so at any speed: of a loss of 0.226, beside readings of 14 and 24 nm, 0.19 was found, and
+4200 squares of 27 300 left."""
 
 
 def _known(
@@ -69,7 +72,7 @@ def _made(recording: Recording, axis: str, kind: str) -> dict[str, Callable[[], 
     made: dict[str, Callable[[], np.ndarray]] = {
         "position_m": lambda: apart(0) if kind == "joint" else motion.position_m,
         "velocity_m_per_s": lambda: apart(1) if kind == "joint" else motion.velocity_m_per_s,
-        _QUIET: lambda: apart(1) if kind == "joint" else motion.quiet_m_per_s,
+        _QUIET_VELOCITY: lambda: apart(1) if kind == "joint" else motion.quiet_m_per_s,
         "acceleration_m_per_s2": lambda: motion.acceleration_m_per_s2,
         "relative_position_m": lambda: apart(0),
         "relative_velocity_m_per_s": lambda: apart(1),
@@ -86,10 +89,19 @@ def _made(recording: Recording, axis: str, kind: str) -> dict[str, Callable[[], 
         made |= {
             "penetration_m": lambda: depth_m,
             "penetration_velocity_m_per_s": lambda: rate_m_per_s,
+            _QUIET_CLOSING: lambda: _closing_way_per_s(recording, side),
             "contact_side_ratio": lambda: side,
             "contact_stiffness_n_per_m": lambda: side_stiffness_n_per_m(joint, side),
         }
     return made
+
+
+def _closing_way_per_s(recording: Recording, side: np.ndarray) -> np.ndarray:
+    """Return how fast the joint closes beyond what its readings scatter by, late as they are, on parts of intervals."""
+    noise_m = float(np.hypot(recording.belief("macro").noise_m, recording.belief("end").noise_m))
+    late_m = relative_motion(recording)[0] - (recording.macro.position_m - recording.motion("end").position_m)
+    read_m = recording.position_m("macro") - recording.position_m("end") + late_m[:, 0]
+    return side * way_per_s(read_m, noise_m, recording.log.period_s)[:, None]
 
 
 def _of_sensor(recording: Recording, axis: str) -> dict[str, np.ndarray]:
