@@ -31,7 +31,7 @@ from bench.blind_names import in_words_of_the_truth
 from bench.seeds import seeds_of
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.heap import give_back, keep_freed
-from stagectl.gap.log import Log
+from stagectl.gap.log import Log, without_saturation
 from stagectl.gap.workflow import find
 from tests.blind import generate, score
 
@@ -60,12 +60,23 @@ def load_set(folder: Path) -> BlindSet:
     runs = tomllib.loads((folder / "runs.toml").read_text())["runs"]
     tables = [_table(folder / run["file"]) for run in runs]
     period_s = modeller["stage"]["rate_s"]
+    believed = _believed(folder.name, modeller, runs[0]["gains"])
+    wholes = [_log(run, table, period_s) for run, table in zip(runs, tables, strict=True)]
+    logs = [without_saturation(whole, believed) for whole in wholes]
     return BlindSet(
-        _believed(folder.name, modeller),
-        tuple(_log(run, table, period_s) for run, table in zip(runs, tables, strict=True)),
+        believed,
+        tuple(logs),
         tuple(run["gains"] for run in runs),
-        tuple(table.get("relative_reference_m") for table in tables),
+        tuple(map(_relative_reference_m, tables, wholes, logs)),
     )
+
+
+def _relative_reference_m(table: dict[str, np.ndarray], whole: Log, log: Log) -> np.ndarray | None:
+    """Return what the stage was asked for between its bodies, in the stretch of a run that is used."""
+    if "relative_reference_m" not in table:
+        return None
+    first = round((log.start_s - whole.start_s) / log.period_s)
+    return table["relative_reference_m"][first : first + log.samples_count]
 
 
 def _table(path: Path) -> dict[str, np.ndarray]:
@@ -99,7 +110,7 @@ def _command_n(table: dict[str, np.ndarray], axis: str, gains: dict[str, float])
     return table[f"{axis}_command_a"] * gains[f"{axis}_force_constant_n_per_a"]
 
 
-def _believed(name: str, modeller: dict[str, Any]) -> Believed:
+def _believed(name: str, modeller: dict[str, Any], gains: dict[str, float]) -> Believed:
     """Say what the modeller states in our words; the modeller's right edge, of end minus macro, is our left one."""
     values, sds = modeller["values"], modeller["standard_deviations"]
     single = modeller["stage"]["axes"] == "single"
@@ -113,6 +124,7 @@ def _believed(name: str, modeller: dict[str, Any]) -> Believed:
             mass_sd_kg=sds[f"{side}_mass_kg"],
             noise_m=modeller["sensors"][f"{sensor}_position_noise_m"],
             current_loop_s=values[f"{side}_current_lag_s"],
+            force_limit_n=gains[f"{side}_force_limit_n"],
             force_constant_n_per_a=values[f"{side}_force_constant_n_per_a"],
             force_constant_sd_ratio=ratio(f"{side}_force_constant_n_per_a"),
             latch_s=values[f"{side}_command_delay_s"],

@@ -41,7 +41,7 @@ def without(name: str, acts_on: str) -> frozenset[str]:
 
 
 def farthest_singles(truths: Iterable[dict[str, Any]]) -> dict[str, tuple[float, int, str]]:
-    """Return (distance to the nearest other law, seed, place) of the single of every effect that is farthest from it.
+    """Return (distance to the nearest law that remains, seed, place) of the single of every effect that is farthest.
 
     What another law does as well, but for less than the floor scatters by, nobody calls unknown who has no law for it:
     a sensor's delay of 283 deviations was a lag but for 86 squares, where the floor of a set scatters by 630 to 880.
@@ -52,9 +52,19 @@ def farthest_singles(truths: Iterable[dict[str, Any]]) -> dict[str, tuple[float,
             continue
         (member,) = truth["effects"]
         if member["above_twice_limit"]:
-            own = member["nearest"][0][2], truth["seed"], member["acts_on"]
+            own = _remaining_distance(member), truth["seed"], member["acts_on"]
             farthest[member["name"]] = max(farthest.get(member["name"], own), own)
     return farthest
+
+
+def _remaining_distance(member: dict[str, Any]) -> float:
+    """Return the distance to the nearest of the laws that remain without a member's: it goes at all its places.
+
+    A scale error is as near to that of the other sensor as can be, and neither is there.
+    """
+    gone = without(member["name"], member["acts_on"])
+    ours = [(without(name, acts_on), distance) for name, acts_on, distance in member["nearest"]]
+    return min(distance for names, distance in ours if not names or not names <= gone)
 
 
 def drawn_truths(seeds: Iterable[int]) -> list[dict[str, Any]]:
@@ -92,7 +102,7 @@ def stands_out(one: Marked) -> bool:
     476 us and a delay, where the floor scatters by 630.
     """
     (member,) = (one.searched.truth or {})["effects"]
-    return member["nearest"][0][2] ** 2 > _SHOWN_SDS * one.searched.reducible_sd
+    return _remaining_distance(member) ** 2 > _SHOWN_SDS * one.searched.reducible_sd
 
 
 def judged_shown(again: Sequence[Marked], right: Sequence[bool], full: bool) -> Figure:

@@ -248,6 +248,21 @@ def test_saturated_stretches_are_left_out_and_said(axis_tables, tmp_path):
     assert "0.1 s (saturated)" in log.remarks[0]
 
 
+def test_a_loop_that_swings_from_limit_to_limit_is_left_out_and_said(axis_tables, tmp_path):
+    command = axis_tables[0]["command"].copy()
+    swing = 100.0 * np.sign(np.sin(2.0 * np.pi * 80.0 * np.arange(500) / 1000.0 + 0.1))
+    swing[::7] *= 0.5  # passing through
+    command[2500:3000] = swing  # an unstable loop, for half a second
+    command[700:760] = swing[:60]  # a move that is commanded briskly
+    command[1000:1200:40] = 100.0  # peaks
+    run = brought_in(with_columns(axis_tables[0], command=command), "run", tmp_path, AXIS_MAP)
+    believed = load_believed(profile_file(tmp_path))
+    log = read_log(run, believed.period_s, believed)
+    assert log.start_s == 0.0
+    assert 2499 <= log.samples_count <= 2503
+    assert "0.499 s (saturated)" in log.remarks[0]
+
+
 def test_an_end_position_that_the_profile_has_no_axis_for_is_said(axis_tables, tmp_path):
     table = with_columns(axis_tables[0], end=axis_tables[0]["position"][::-1])
     run = brought_in(table, "run", tmp_path, {**AXIS_MAP, "end_position_m": "end:m"})

@@ -31,7 +31,7 @@ from stagectl.gap.selection import lacks_a_name, select
 from stagectl.gap.settling import remeasured
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
-from tests.blind import draw, generate
+from tests.blind import draw, generate, laws
 
 H, MASS = 1e-3, 40.0
 
@@ -230,6 +230,20 @@ def _table_judge(draw, library, *, base=(), training=2, curves=(), runs=3):
         lambda _, groups: [0.0] * len(groups), curves=list(curves), threshold=20.0,
     )  # fmt: skip
     return judge
+
+
+@pytest.mark.parametrize(("name", "best"), [("current_ripple", (3,)), ("stribeck_friction", (1,))])
+def test_of_a_pitch_the_two_best_places_are_searched_from(name, best):
+    """One of 54.8 mm was found at half of it: 27.8 mm gains more than 60.7, from where a search leads there (1005065)."""
+
+    def draw(run, random):
+        half, far, truth = random.standard_normal((3, 1000))
+        return [random.standard_normal(1000) + truth, half + 0.5 * truth, far + 0.4 * truth, truth]
+
+    half, far, truth = (Group((name, "macro_actuator"), (column,)) for column in (1, 2, 3))
+    judge = _table_judge(draw, [far, half])
+    judge.refine = lambda _, groups: [truth if group is far else group for group in groups]
+    assert [group.columns for group in judge.rivals([])] == [best]
 
 
 def test_what_is_known_keeps_names_apart_that_motion_does_not():
@@ -682,6 +696,31 @@ def test_edges_that_wear_are_a_curve_over_time_beside_a_wider_gap(tmp_path):
     values_m, sds_m = solve([*search.judge.base, found], search.evidence.sums).of(found)
     slope_m_per_s, _ = np.polyfit(knots_s, values_m, 1, w=1.0 / sds_m)
     assert slope_m_per_s == pytest.approx(0.5 * hidden.values["rate_m_per_s"], rel=0.3)  # each edge by half of it
+
+
+def test_a_sensor_that_drifts_is_a_curve_over_time_beside_a_joint_that_lies_elsewhere(tmp_path):
+    """Without a law of drifts one of 14 um in 90 s was the joint's centre but for 200 squares (1005043)."""
+    case = generate.draw(3197, "single", 6.0)
+    drift = {"total_m": -30e-6, "time_constant_s": 60.0}
+    case.effects = [draw.Effect(laws.BY_NAME["thermal_drift"], "end_sensor", drift)]
+    case.runs = [run for run in draw.simulate(case) if run.recipe == "two_sided_contact"]
+    generate.write(case, tmp_path)
+    blind = load_set(tmp_path)
+    (log,), joint = blind.logs, blind.believed.joint
+    assert joint is not None
+    at_s = log.start_s + float(np.median(log.times_s))
+    much_m = drift["total_m"] * -np.expm1(-at_s / drift["time_constant_s"])  # as a first look found it
+    joint = dataclasses.replace(joint, left_m=joint.left_m + much_m, right_m=joint.right_m - much_m)
+    recordings = [balance.recording_of(log, dataclasses.replace(blind.believed, joint=joint))]
+    search = Competition(recordings, 1, without=frozenset({"thermal_drift"}), noise=noise_of(recordings))
+    found = finer_curve(search, [], 0.0)
+    assert found is not None
+    assert found.key == ("curve over t_s", "contact_centre")
+    knots_s = np.array([float(name) for name in search.term(found).amplitudes])
+    values_m, sds_m = solve([*search.judge.base, found], search.evidence.sums).of(found)
+    slope_m_per_s, _ = np.polyfit(knots_s, values_m, 1, w=1.0 / sds_m)
+    drifts_m_per_s = (drift["total_m"] - much_m) / drift["time_constant_s"]  # what reads less lies further to the right
+    assert slope_m_per_s == pytest.approx(-drifts_m_per_s, rel=0.3)
 
 
 def test_what_moved_a_joint_and_is_nothing_at_its_size_is_not_told(tmp_path):

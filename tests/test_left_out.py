@@ -36,7 +36,8 @@ def test_our_names_of_a_law_of_the_truth():
 
 def test_an_effect_is_left_out_of_the_set_that_no_other_law_comes_near():
     def single(seed, name, nearest):
-        return one(seed, "single", [found(name)], member(name) | {"nearest": nearest})
+        place = "macro_sensor" if name == "scale_error" else "macro_force"
+        return one(seed, "single", [found(name)], member(name) | {"nearest": nearest, "acts_on": place})
 
     lag, mass = ["sensor_lag", "macro_sensor"], ["mass_error", "macro_force"]
     sets = [
@@ -44,6 +45,8 @@ def test_an_effect_is_left_out_of_the_set_that_no_other_law_comes_near():
         single(2, "sensor_delay", [[*lag, 38.3], [*mass, 40.0]]),
         single(3, "sensor_delay", [[*lag, 0.8], [*mass, 900.0]]),
         single(4, "coulomb_friction", [[*mass, 12.0]]),
+        single(8, "scale_error", [["scale_error", "end_sensor", 0.1], [*mass, 54.0]]),  # goes at both sensors
+        single(9, "scale_error", [["scale_error", "end_sensor", 2.2], [*mass, 40.0]]),
         one(5, "multi", [found()], member("offset"), member("tilt")),
         one(6, "null"),
     ]
@@ -53,6 +56,7 @@ def test_an_effect_is_left_out_of_the_set_that_no_other_law_comes_near():
     assert farthest_singles(truths) == {
         "sensor_delay": (38.3, 2, "macro_force"),
         "coulomb_friction": (12.0, 4, "macro_force"),
+        "scale_error": (54.0, 8, "macro_sensor"),
     }
 
 

@@ -37,6 +37,7 @@ CLOSING = "penetration_velocity_m_per_s"
 _CLOSING_RATIO = np.array([-1.0, -0.3, -0.1, -0.03, -0.01, 0.0, 0.01, 0.03, 0.1, 0.3, 1.0])  # of the fastest
 
 _EDGE = "contact_edge"
+_CENTRE = "contact_centre"
 _EDGE_KNOTS_COUNT = 8
 _MOST_MOVED_M = 1e-3
 
@@ -55,7 +56,7 @@ def finer_curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
 
     Over position with steps of a quarter of those of other curves, over the time since each body turned round, over the
     past of each motor, of what a sensor reads too much over where it is, over how fast the joint closes in contact, and
-    of where its edges are over time.
+    of where its edges and its middle are over time.
     """
     for axis in recordings[0].axes:
         yield from _over(recordings, axis, "position_m", _FINE_KNOTS_COUNT)
@@ -70,7 +71,7 @@ def unit_of(term: Term) -> str:
     """Return what the values of a curve are: N of a force, m of a reading or an edge, a ratio of a motor's force."""
     if term.name == f"curve over {AGO}":
         return "ratio"
-    return "m" if term.acts_on.endswith(("_sensor", _EDGE)) else "N"
+    return "m" if term.acts_on.endswith(("_sensor", _EDGE, _CENTRE)) else "N"
 
 
 def _over(recordings: Sequence[Recording], axis: str, quantity: str, knots_count: int) -> Iterator[Term]:
@@ -182,26 +183,29 @@ def _hats_closing(knots: np.ndarray, r: Recording) -> list[Forces]:
 
 
 def _edges_over_time(recordings: Sequence[Recording]) -> Iterator[Term]:
-    """Yield by how much both edges lie further out than at the first touch, over time; none where nothing touches.
+    """Yield by how much both edges lie further out, and to which side, than at the first touch, over time.
 
-    Edges that wear by 0.2 um/s, of 128 000 squares, were a gap that is wider but for 1200, at a floor that scatters by
-    780: of those the other curves found 37 and less, this one all. Knots lie where it touches, equally often between
-    any two; a constant is none of it, that is the width.
+    None where nothing touches. Edges that wear by 0.2 um/s, of 128 000 squares, were a gap that is wider but for 1200,
+    at a floor that scatters by 780: of those the other curves found 37 and less, this one all. A sensor that drifts, of
+    16 600 squares, was a joint that lies elsewhere but for 200, of which edges further out found 10. Knots lie where it
+    touches, equally often between any two; a constant is none of it, that is the width, or the centre.
     """
     touched_s = [_edge_times(r)[inside] for r in recordings for _, inside in [_closing(r)] if np.any(inside)]
     if not touched_s:
         return
     knots = np.unique(np.quantile(np.concatenate(touched_s), np.linspace(0.0, 1.0, _EDGE_KNOTS_COUNT)))
     if knots.size > 1:
-        yield _curve("t_s", _EDGE, knots[1:], partial(_hats_moved, knots), _MOST_MOVED_M)
+        for place, left_ratio in ((_EDGE, 1.0), (_CENTRE, -1.0)):
+            yield _curve("t_s", place, knots[1:], partial(_hats_moved, left_ratio, knots), _MOST_MOVED_M)
 
 
 def _edge_times(r: Recording) -> np.ndarray:
     return quantities(r, "end", _EDGE)["t_s"]
 
 
-def _hats_moved(knots: np.ndarray, r: Recording) -> list[Forces]:
-    return [edges_moved(r, weight, weight, whole=False) for weight in _weights(_edge_times(r), knots)[1:]]
+def _hats_moved(left_ratio: float, knots: np.ndarray, r: Recording) -> list[Forces]:
+    weights = _weights(_edge_times(r), knots)[1:]
+    return [edges_moved(r, left_ratio * weight, weight, whole=False) for weight in weights]
 
 
 def _weights(value: np.ndarray, knots: np.ndarray) -> np.ndarray:

@@ -151,8 +151,8 @@ def unknown_figure(unknown: dict[str, Any], image_format: str = "svg") -> bytes:
 
 
 def curve_of(unknown: Mapping[str, Any]) -> str:
-    """Return what a curve is of: its unit, but of an edge, which is in metres as readings are."""
-    return "edge" if unknown["acts_on"] == "contact_edge" else str(unknown["unit"])
+    """Return what a curve is of: its unit, but of the joint's edges, which is in metres as readings are."""
+    return {"contact_edge": "edge", "contact_centre": "centre"}.get(unknown["acts_on"], str(unknown["unit"]))
 
 
 _QUANTITIES = {
@@ -169,6 +169,7 @@ _CURVES = {
     "N": (1.0, "force (N)", "force"),
     "m": (1e6, "read too much (µm)", "reading"),
     "edge": (1e6, "edges further out (µm)", "place of the edges"),
+    "centre": (1e6, "joint further to the right (µm)", "place of the joint"),
     "ratio": (1.0, "felt of the motor's force (ratio)", "answer"),
 }
 """By what a curve is of: its scale, the label of its axis, what it is."""

@@ -365,6 +365,7 @@ _CURVES = {
     "N": "The force that repeats on runs that no fit saw",
     "m": "What the sensor reads too much in all runs",
     "edge": "By how much both of the joint's edges lie further out than where it first touched",
+    "centre": "By how much the joint lies further to the right than where it first touched",
     "ratio": "What the body feels of its motor's force of so long ago, beyond what is known of its drive",
 }
 """What a curve shows, by what it is of."""

@@ -246,8 +246,10 @@ class Judge:
             shapes = by_name.setdefault(group.key, [])
             shapes.append((gain - self.price() * group.complexity, group))
             shapes.sort(key=lambda row: -row[0])
-            # at a few sizes only: which of two places is better shows when each has its own
-            del shapes[2 if at_size > 0.0 and not CATALOGUE[group.key[0]].searched else 1 :]
+            # at a few sizes only: which of two places is better shows when each has its own; and which of two pitches
+            # when each is searched: of one of 54.8 mm the other half of its line, at 60.7 mm, gained less than a half
+            searched = CATALOGUE[group.key[0]].searched if group.key[0] in CATALOGUE else ()
+            del shapes[2 if "pitch_m" in searched or (at_size > 0.0 and not searched) else 1 :]
         ranked = sorted(by_name.values(), key=lambda shapes: -shapes[0][0])
         possible = (shapes for shapes in ranked[: 4 * most] if self.allows([*chosen, shapes[0][1]]))
         found: dict[tuple[str, str], Group] = {}
