@@ -234,7 +234,7 @@ def _table_judge(draw, library, *, base=(), training=2, curves=(), runs=3):
 
 @pytest.mark.parametrize(("name", "best"), [("current_ripple", (3,)), ("stribeck_friction", (1,))])
 def test_of_a_pitch_the_two_best_places_are_searched_from(name, best):
-    """One of 54.8 mm was found at half of it: 27.8 mm gains more than 60.7, from where a search leads there (1005065)."""
+    """One of 54.8 mm was found at half of it: 27.8 mm gains more than 60.7, where a search finds it (1005065)."""
 
     def draw(run, random):
         half, far, truth = random.standard_normal((3, 1000))
@@ -676,49 +676,48 @@ def test_what_one_recording_alone_has_is_a_rest_only_where_it_is_more(late, is_a
     assert (found is None or found.key != rest) == is_alone
 
 
-def test_edges_that_wear_are_a_curve_over_time_beside_a_wider_gap(tmp_path):
-    """A joint of which only a width that is wrong was said: 1200 of 128 000 squares were left, and no curve's."""
+def _drawn_touching(tmp_path, effects):
+    """Return the recording of a hidden case that touches both edges, as it is read, and the case."""
     case = generate.draw(3197, "single", 6.0)
-    case.effects = [one.scaled(3.0) for one in case.effects]
+    case.effects = effects(case)
     case.runs = [run for run in draw.simulate(case) if run.recipe == "two_sided_contact"]
     generate.write(case, tmp_path)
-    blind = load_set(tmp_path)
-    (log,), joint, (hidden,) = blind.logs, blind.believed.joint, case.effects
+    return load_set(tmp_path), case
+
+
+def _slope_of_rest_m_per_s(blind, left_m, right_m, without, place):
+    """Return how fast the finer curve over time goes that is left of a joint whose edges lie further out."""
+    joint = blind.believed.joint
     assert joint is not None
-    out_m = 0.5 * hidden.values["rate_m_per_s"] * (log.start_s + np.median(log.times_s))  # as a first look found it
-    joint = dataclasses.replace(joint, left_m=joint.left_m + out_m, right_m=joint.right_m + out_m)
-    recordings = [balance.recording_of(log, dataclasses.replace(blind.believed, joint=joint))]
-    search = Competition(recordings, 1, without=frozenset({"backlash_wear"}), noise=noise_of(recordings))
+    joint = dataclasses.replace(joint, left_m=joint.left_m + left_m, right_m=joint.right_m + right_m)
+    recordings = [balance.recording_of(log, dataclasses.replace(blind.believed, joint=joint)) for log in blind.logs]
+    search = Competition(recordings, 1, without=frozenset({without}), noise=noise_of(recordings))
     found = finer_curve(search, [], 0.0)
     assert found is not None
-    assert found.key == ("curve over t_s", "contact_edge")
+    assert found.key == ("curve over t_s", place)
     knots_s = np.array([float(name) for name in search.term(found).amplitudes])
     values_m, sds_m = solve([*search.judge.base, found], search.evidence.sums).of(found)
-    slope_m_per_s, _ = np.polyfit(knots_s, values_m, 1, w=1.0 / sds_m)
+    return np.polyfit(knots_s, values_m, 1, w=1.0 / sds_m)[0]
+
+
+def test_edges_that_wear_are_a_curve_over_time_beside_a_wider_gap(tmp_path):
+    """A joint of which only a width that is wrong was said: 1200 of 128 000 squares were left, and no curve's."""
+    blind, case = _drawn_touching(tmp_path, lambda case: [one.scaled(3.0) for one in case.effects])
+    (log,), (hidden,) = blind.logs, case.effects
+    out_m = 0.5 * hidden.values["rate_m_per_s"] * (log.start_s + np.median(log.times_s))  # as a first look found it
+    slope_m_per_s = _slope_of_rest_m_per_s(blind, out_m, out_m, "backlash_wear", "contact_edge")
     assert slope_m_per_s == pytest.approx(0.5 * hidden.values["rate_m_per_s"], rel=0.3)  # each edge by half of it
 
 
 def test_a_sensor_that_drifts_is_a_curve_over_time_beside_a_joint_that_lies_elsewhere(tmp_path):
     """Without a law of drifts one of 14 um in 90 s was the joint's centre but for 200 squares (1005043)."""
-    case = generate.draw(3197, "single", 6.0)
     drift = {"total_m": -30e-6, "time_constant_s": 60.0}
-    case.effects = [draw.Effect(laws.BY_NAME["thermal_drift"], "end_sensor", drift)]
-    case.runs = [run for run in draw.simulate(case) if run.recipe == "two_sided_contact"]
-    generate.write(case, tmp_path)
-    blind = load_set(tmp_path)
-    (log,), joint = blind.logs, blind.believed.joint
-    assert joint is not None
+    law = laws.BY_NAME["thermal_drift"]
+    blind, _ = _drawn_touching(tmp_path, lambda case: [draw.Effect(law, "end_sensor", drift)])
+    (log,) = blind.logs
     at_s = log.start_s + float(np.median(log.times_s))
     much_m = drift["total_m"] * -np.expm1(-at_s / drift["time_constant_s"])  # as a first look found it
-    joint = dataclasses.replace(joint, left_m=joint.left_m + much_m, right_m=joint.right_m - much_m)
-    recordings = [balance.recording_of(log, dataclasses.replace(blind.believed, joint=joint))]
-    search = Competition(recordings, 1, without=frozenset({"thermal_drift"}), noise=noise_of(recordings))
-    found = finer_curve(search, [], 0.0)
-    assert found is not None
-    assert found.key == ("curve over t_s", "contact_centre")
-    knots_s = np.array([float(name) for name in search.term(found).amplitudes])
-    values_m, sds_m = solve([*search.judge.base, found], search.evidence.sums).of(found)
-    slope_m_per_s, _ = np.polyfit(knots_s, values_m, 1, w=1.0 / sds_m)
+    slope_m_per_s = _slope_of_rest_m_per_s(blind, much_m, -much_m, "thermal_drift", "contact_centre")
     drifts_m_per_s = (drift["total_m"] - much_m) / drift["time_constant_s"]  # what reads less lies further to the right
     assert slope_m_per_s == pytest.approx(-drifts_m_per_s, rel=0.3)
 
