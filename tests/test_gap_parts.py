@@ -722,6 +722,24 @@ def test_a_sensor_that_drifts_is_a_curve_over_time_beside_a_joint_that_lies_else
     assert slope_m_per_s == pytest.approx(-drifts_m_per_s, rel=0.3)
 
 
+@pytest.mark.parametrize(("name", "parameter"), [("sensor_delay", "delay_s"), ("sensor_lag", "time_constant_s")])
+def test_a_lag_in_a_delays_place_is_spread_out(name, parameter, tmp_path):
+    """To a library without lags one of 368 us was a delay but for 13 squares (1004043)."""
+    case = generate.draw(3197, "single", 6.0)
+    case.effects = [draw.Effect(laws.BY_NAME["sensor_lag"], "end_sensor", {"lag_s": 345e-6})]
+    case.runs = draw.simulate(case)
+    generate.write(case, tmp_path)
+    blind = load_set(tmp_path)
+    late = ({"name": name, "acts_on": "end_sensor", parameter: 345e-6},)
+    recordings = [balance.recording_of(log, blind.believed, late=late) for log in blind.logs]
+    search = Competition(recordings, len(recordings), noise=noise_of(recordings))
+    (spread,) = (curve for curve in search.finer_curves() if search.term(curve).name == "curve over lateness_s")
+    values, sds = solve([*search.judge.base, spread], search.evidence.sums).of(spread)
+    assert values[0] == pytest.approx(1.0 if name == "sensor_delay" else 0.0, abs=3.0 * sds[0])
+    found = finer_curve(search, [], 0.0)
+    assert (found and found.key) == (spread.key if name == "sensor_delay" else None), search.judge.trace
+
+
 def test_what_moved_a_joint_and_is_nothing_at_its_size_is_not_told(tmp_path):
     """Without a law of soft contacts a search ended with an error that named nothing (3087)."""
     generate.write(generate.draw(3197, "single", 2.0), tmp_path)
@@ -746,6 +764,7 @@ def test_a_look_above_more_noise_does_not_say_that_nothing_is_left():
     assert excess(plain.search.judge, plain.chosen) < excess(look.search.judge, look.chosen)
     assert not _has_reached_floor(plain, look, {"gain": 2000.0, "left": 1200.0})  # a curve's
     assert _has_reached_floor(plain, look, {"gain": 500.0, "left": 21700.0})  # what a law is inexact by
+    assert not _has_reached_floor(plain, look, {"gain": 500.0, "left": 21700.0, "over": "lateness_s"})  # nobody asked
     # a machine without force noise has none: 0.7 % is more than exact laws leave, above whatever level
     assert unknown_rest(quieter.search, quieter.chosen, excess(quieter.search.judge, [])) is None
     assert not _has_reached_floor(quieter, look, {"gain": 500.0, "left": 21700.0})

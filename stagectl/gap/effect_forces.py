@@ -5,7 +5,7 @@ import numpy as np
 from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import late_readings
 from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
-from stagectl.gap.late_readings import makes_late
+from stagectl.gap.late_readings import Row, makes_late
 from stagectl.gap.quantities import along_motion, arguments_of, quantities
 from stagectl.gap.reading_errors import SMALL_M, misread, more_contact_n, reading_error_m
 from stagectl.gap.recording import REACTION, Recording, contact_push_n, driven_by, relative_motion, with_late
@@ -41,6 +41,18 @@ def _later(recording: Recording, effect: Effect, place: str, parameters: list[fl
     if key not in recording.exchanged:
         recording.exchanged[key] = scaled_forces(_exchanged(with_late(recording, others)), -1.0, Forces())
     return sum_of_forces(_exchanged(with_late(recording, (*others, row))), recording.exchanged[key])
+
+
+def spread_out(recording: Recording, row: Row) -> Forces:
+    """Return what changes where readings come as late in the mean, but all at once where they lagged, or else lag."""
+    key = row["name"], row["acts_on"]
+    (late_s,) = (row[name] for name in CATALOGUE[row["name"]].parameters)
+    others = tuple(one for one in recording.late if (one["name"], one["acts_on"]) != key)
+    other = CATALOGUE[SPREADS[row["name"]]]
+    instead = {"name": other.name, "acts_on": row["acts_on"], other.parameters[0]: late_s}
+    return sum_of_forces(
+        _exchanged(with_late(recording, (*others, instead))), scaled_forces(_exchanged(recording), -1.0, Forces())
+    )
 
 
 def _exchanged(recording: Recording) -> Forces:
@@ -103,6 +115,9 @@ def effect_forces(
 
 
 _TINY = 1e-9
+
+SPREADS = {"sensor_delay": "sensor_lag", "sensor_lag": "sensor_delay"}
+"""What comes late all at once, or spread out over time: laws of the same lateness, each the other one of the other."""
 
 
 def _swung_n(recording: Recording, axis: str, effect: Effect, parameters: list[float]) -> np.ndarray:

@@ -142,6 +142,8 @@ def unknown_figure(unknown: dict[str, Any], image_format: str = "svg") -> bytes:
         values, half = unit * np.asarray(unknown["values"], float), 1.96 * unit * np.asarray(unknown["sds"], float)
         axes.fill_between(knots, values - half, values + half, color=_AFTER, alpha=0.22, linewidth=0.0)
         axes.plot(knots, values, color=_AFTER, marker="o", markersize=3.5, label=f"{what} that no effect explains")
+        if knots.size == 1:  # no width to fill
+            axes.errorbar(knots, values, half, color=_AFTER, alpha=0.3, linewidth=6.0)
         axes.plot([], [], color=_AFTER, alpha=0.3, linewidth=6.0, label="95 % band")
         axes.axhline(0.0, color=MUTED, linewidth=0.6)
         axes.set_xlabel(label)
@@ -151,7 +153,9 @@ def unknown_figure(unknown: dict[str, Any], image_format: str = "svg") -> bytes:
 
 
 def curve_of(unknown: Mapping[str, Any]) -> str:
-    """Return what a curve is of: its unit, but of the joint's edges, which is in metres as readings are."""
+    """Return what a curve is of: its unit, but of the joint's edges, in metres as readings are, and of what is late."""
+    if unknown["over"] == "lateness_s":
+        return "spread"
     return {"contact_edge": "edge", "contact_centre": "centre"}.get(unknown["acts_on"], str(unknown["unit"]))
 
 
@@ -162,6 +166,7 @@ _QUANTITIES = {
     "t_s": (1.0, "time (s)"),
     "since_reversal_s": (1.0, "time since the last reversal (s)"),
     "motor_force_ago_s": (1e3, "time since the motor's force (ms)"),
+    "lateness_s": (1e3, "how late the reading is (ms)"),
     "penetration_velocity_m_per_s": (1e3, "closing speed in contact (mm/s)"),
 }
 
@@ -171,6 +176,7 @@ _CURVES = {
     "edge": (1e6, "edges further out (µm)", "place of the edges"),
     "centre": (1e6, "joint further to the right (µm)", "place of the joint"),
     "ratio": (1.0, "felt of the motor's force (ratio)", "answer"),
+    "spread": (1.0, "spread as a lag spreads it (ratio)", "spread of what is late"),
 }
 """By what a curve is of: its scale, the label of its axis, what it is."""
 

@@ -367,6 +367,7 @@ _CURVES = {
     "edge": "By how much both of the joint's edges lie further out than where it first touched",
     "centre": "By how much the joint lies further to the right than where it first touched",
     "ratio": "What the body feels of its motor's force of so long ago, beyond what is known of its drive",
+    "spread": "How far the late reading is spread out over time, or not where it lags: 1 is a lag in a delay's place",
 }
 """What a curve shows, by what it is of."""
 

@@ -30,6 +30,10 @@ _FINER_TAIL = 1e-6
 much but 60 squares (51 is so much) beside 1.4 million, where 700 are material; beside five names in the place of a
 clock of 6000 squares, what is late found 46, where noise gives 40 so seldom."""
 
+_NUMBER_TAIL = 1e-4
+"""The same of a single number, whether what is late is spread out: a lag in a delay's place gained 33 and 22 squares,
+beside right delays and lags of 7 sets it gained 2 at most (15 is what noise gives so seldom)."""
+
 _SHARED_TAIL = 0.01
 """The same of all recordings but one, for what is not a single one's."""
 
@@ -116,7 +120,8 @@ def finer_curve(search: Competition, chosen: list[Group], material: float) -> Gr
     for curve in search.finer_curves():
         gained = search.judge.gain([*chosen, curve]) - now
         search.judge.trace.append(f"{search.term(curve).name}, finer, on {curve.key[1]} finds {gained:.0f}")
-        by_noise = float(chi2.isf(_FINER_TAIL, len(curve.columns)))
+        count = len(curve.columns)
+        by_noise = float(chi2.isf(_FINER_TAIL if count > 1 else _NUMBER_TAIL, count))
         if gained > max(material, by_noise) and (
             gained > _ALONE_RATIO * by_noise or not _is_in_one_alone(search, chosen, curve)
         ):

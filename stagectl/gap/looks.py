@@ -14,6 +14,7 @@ from stagectl.effects import CATALOGUE, Trait
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Crew
 from stagectl.gap.curvature import at_best_shapes
+from stagectl.gap.curves import LATENESS
 from stagectl.gap.findings import Alias, Named
 from stagectl.gap.innovations import Noise
 from stagectl.gap.judge import ALIAS_GAIN, LEFT_SDS, Judge
@@ -156,7 +157,10 @@ def _has_reached_floor(plain: Look, look: Look, rest: dict[str, Any]) -> bool:
     of 1200 that were left where they are, a curve over time found all. Of what laws are inexact by none finds much:
     beside a friction along its own motion 500 of 21 700. What laws leave that are exact in the closer look is no
     force noise of the first one: under that a Dahl friction in the place of bristles left 28 600 of 7.8 million.
+    Whether what is late is spread out it is not asked, as nothing is late in it.
     """
+    if rest.get("over") == LATENESS:
+        return False
     if _is_quieter(look.search.noise, plain.search.noise) and rest["gain"] > _CURVES_REST_RATIO * rest["left"]:
         return False
     left, first = excess(plain.search.judge, plain.chosen), excess(plain.search.judge, [])
