@@ -300,18 +300,11 @@ def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew, closer
     for k, group in enumerate(look.chosen):
         if not moves_readings(search, group):
             continue
-        rest = [*chosen[:k], *chosen[k + 1 :]]
-        now = search.judge.gain(chosen)
-        gained = now - search.judge.gain(rest)
-        least = now - max(ALIAS_GAIN, _FORMS_RATIO * gained)
         told_closer = () if closer is None else _aliases_in_readings(closer, group.key)
         own = (alias for one in named if (one.name, one.acts_on) == group.key for alias in one.aliases)
-        stated = {alias[:2] for alias in (*own, *told_closer)}
-        others = [other for other in search.judge.rivals(rest) if _is_other_form(search, group, other, stated)]
-        forms = [
-            group,
-            *(other for other in others if other.key in stated or search.judge.gain([*rest, other]) > least),
-        ]
+        rest = [*chosen[:k], *chosen[k + 1 :]]
+        gained = search.judge.gain(chosen) - search.judge.gain(rest)
+        forms = _forms_of(search, rest, group, gained, {alias[:2] for alias in (*own, *told_closer)})
         models = [[*rest, one] for one in forms] if len(forms) > 1 else []
         left = _left_under(search, models, unsettled, crew, closer)
         prices = [search.judge.price() * form(one) for one in forms]
@@ -326,6 +319,18 @@ def _of_best_form(look: Look, unsettled: Sequence[Recording], crew: Crew, closer
         told = _named_as(look, chosen, k, gone, also)
         named = (*(one for one in named if (one.name, one.acts_on) != group.key), *told)
     return Look(search, chosen, named)
+
+
+def _forms_of(
+    search: Competition, rest: list[Group], group: Group, gained: float, stated: Collection[tuple[str, str]]
+) -> list[Group]:
+    """Return a name that moves readings, and what gains nearly as much as its column, or is `stated` as its alias.
+
+    gained: by the name beside the `rest`.
+    """
+    least = search.judge.gain([*rest, group]) - max(ALIAS_GAIN, _FORMS_RATIO * gained)
+    others = (other for other in search.judge.rivals(rest) if _is_other_form(search, group, other, stated))
+    return [group, *(one for one in others if one.key in stated or search.judge.gain([*rest, one]) > least)]
 
 
 def _is_other_form(search: Competition, group: Group, other: Group, stated: Collection[tuple[str, str]] = ()) -> bool:
