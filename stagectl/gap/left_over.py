@@ -32,7 +32,7 @@ clock of 6000 squares, what is late found 46, where noise gives 40 so seldom."""
 
 _NUMBER_TAIL = 1e-4
 """The same of a single number, whether what is late is spread out: a lag in a delay's place gained 33 and 22 squares,
-beside right delays and lags of 7 sets it gained 2 at most (15 is what noise gives so seldom)."""
+beside the right one of 18 sets it gained 5 at most (15 is what noise gives so seldom)."""
 
 _SHARED_TAIL = 0.01
 """The same of all recordings but one, for what is not a single one's."""

@@ -89,7 +89,8 @@ def way_per_s(read_m: np.ndarray, noise_m: float, period_s: float) -> np.ndarray
 
     It carries what lies between two stops (play). Where a contact was pressed by 40 um, or pressed and let go by 50 um,
     readings of 20 nm made errors of 24 and 27 % in what turns over 6 um by the filter's velocity, of 4 and 10 % by
-    smoothed ones, and of 0.2 and 0.6 % by this. With stops as far apart again reversals come late: a loss came out 2.4 % too small.
+    smoothed ones, and of 0.2 and 0.6 % by this. With stops as far apart again reversals come late: a loss came out
+    2.4 % too small.
     """
     smoothed_m = np.asarray(savgol_filter(read_m, _QUIET_WINDOW, _ORDER))
     carried_m = _carried(smoothed_m, _STOPS_RATIO * noise_m)
