@@ -29,6 +29,7 @@ from pyarrow import csv
 
 from bench.blind_names import in_words_of_the_truth
 from bench.seeds import seeds_of
+from stagectl.errors import RecordError
 from stagectl.gap.believed import Believed, BelievedAxis, BelievedJoint
 from stagectl.gap.heap import give_back, keep_freed
 from stagectl.gap.log import Log, without_saturation
@@ -61,14 +62,16 @@ def load_set(folder: Path) -> BlindSet:
     tables = [_table(folder / run["file"]) for run in runs]
     period_s = modeller["stage"]["rate_s"]
     believed = _believed(folder.name, modeller, runs[0]["gains"])
-    wholes = [_log(run, table, period_s) for run, table in zip(runs, tables, strict=True)]
-    logs = [without_saturation(whole, believed) for whole in wholes]
-    return BlindSet(
-        believed,
-        tuple(logs),
-        tuple(run["gains"] for run in runs),
-        tuple(map(_relative_reference_m, tables, wholes, logs)),
-    )
+    used = []
+    for run, table in zip(runs, tables, strict=True):
+        whole = _log(run, table, period_s)
+        try:
+            log = without_saturation(whole, believed)
+        except RecordError:  # as a user does who is told to record it anew
+            continue
+        used.append((log, run["gains"], _relative_reference_m(table, whole, log)))
+    logs, gains, relative_m = zip(*used, strict=True)
+    return BlindSet(believed, logs, gains, relative_m)
 
 
 def _relative_reference_m(table: dict[str, np.ndarray], whole: Log, log: Log) -> np.ndarray | None:

@@ -17,6 +17,7 @@ from stagectl.gap.believed import Believed, BelievedAxis
 from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.competition import Competition
 from stagectl.gap.evidence import Added
+from stagectl.gap.findings import PARAMETER
 from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.forces import Forces
 from stagectl.gap.hypotheses import widest_amplitudes
@@ -244,6 +245,24 @@ def test_of_a_pitch_the_two_best_places_are_searched_from(name, best):
     judge = _table_judge(draw, [far, half])
     judge.refine = lambda _, groups: [truth if group is far else group for group in groups]
     assert [group.columns for group in judge.rivals([])] == [best]
+
+
+def test_of_parameters_that_do_as_well_the_one_that_is_stated_less_well_is_wrong():
+    """A push back that is stated exactly was 3.4 % off, and a force constant only its alias (1006005)."""
+
+    def draw(run, random):
+        wrong, other = random.standard_normal((2, 1000))
+        exact = wrong + 0.02 * other
+        return [random.standard_normal(1000) + 0.5 * exact, wrong, exact, wrong, exact]
+
+    names = ("force_constant", 0.1, 1), ("micro_reaction", 1e-6, 2)
+    base = [Group((name, PARAMETER), (column,), prior_sds=(sd,)) for name, sd, column in names]
+    loose, exact = (Group((name, PARAMETER), (column + 2,), prior_sds=(1.0,)) for name, _, column in names)
+    judge = _table_judge(draw, [loose, exact], base=base)
+    assert judge.gain([exact]) > judge.gain([loose])  # as the hidden one would, but for what is known of it
+    assert select(judge) == [loose]
+    assert aliases_of(judge, [loose], loose) == []
+    assert [key for key, _ in aliases_of(judge, [exact], exact)] == [loose.key]
 
 
 def test_what_is_known_keeps_names_apart_that_motion_does_not():

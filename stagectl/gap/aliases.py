@@ -46,6 +46,9 @@ def aliases_of(judge: Judge, chosen: Sequence[Group], group: Group) -> list[tupl
         margin = with_it - judge.gain([*beside, other])
         share = margin / max(gained, 1e-300)
         inexact = margin < left and share < ALIAS_SHARE and _lies_between(margin, apart)
+        is_unlikely = judge.surprise(beside, other) - judge.surprise(rest, group) > ALIAS_GAIN
+        if is_unlikely:
+            continue
         if apart < ALIAS_GAIN or inexact or _is_rough_friction(judge, group, other, share):
             margins[other.key] = margin
     return sorted(margins.items(), key=lambda row: row[1])

@@ -6,6 +6,7 @@ of what is reducible at all, and when recordings that no fit saw do not speak ag
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -14,6 +15,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stagectl.effects import CATALOGUE
+from stagectl.gap.findings import PARAMETER
 from stagectl.gap.kinds import has_akin, is_friction, is_smooth
 from stagectl.gap.normal_equations import Fold, Group, Sums, covers, held_out_gain, solve, within_bounds
 
@@ -353,9 +355,9 @@ class Judge:
 
         What a known parameter does is exact, and its stated uncertainty is paid for by its prior.
         """
-        if group.key[1] != "parameter":
+        if group.key[1] != PARAMETER:
             return NAMING_RATIO * self.threshold + SEARCH_PRICE * group.searched
-        is_alone = not self.at_size and all(other.key[1] == "parameter" for other in chosen)
+        is_alone = not self.at_size and all(other.key[1] == PARAMETER for other in chosen)
         return self._threshold_of_parameters() if is_alone else self.threshold
 
     def _threshold_of_parameters(self) -> float:
@@ -365,7 +367,19 @@ class Judge:
         whole library gains on noise an error of 5.5 deviations, half of which the mass took, was none (15 squares of
         25). Beside effects, laws are not that exact: a spring of the joint that gained 12 was 23 deviations off.
         """
-        return _largest_chi_square(sum(group.key[1] == "parameter" for group in self.library))
+        return _largest_chi_square(sum(group.key[1] == PARAMETER for group in self.library))
+
+    def surprise(self, beside: Sequence[Group], group: Group) -> float:
+        """Return what speaks against a known parameter that is off by so much, in squares of the noise; 0 of an effect.
+
+        By how many of its stated deviations one is off that is wrong nobody knows: twice as many are half as likely. A
+        push back that is stated exactly was 3.4 % off, by one square more than a force constant that was.
+        """
+        stated = next((one.prior_sds[0] for one in self.base if one.key == group.key), None)
+        if group.key[1] != PARAMETER or stated is None:
+            return 0.0
+        error = float(solve([*self.base, *beside, group], self.source.sums).of(group)[0][0])
+        return 2.0 * math.log(max(abs(error) / stated, 1.0))
 
     def left_at_most(self, chosen: Sequence[Group]) -> float:
         """Return what is left above the floor at most, in squares of the noise.

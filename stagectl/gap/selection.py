@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Sequence
 
+from stagectl.gap.findings import PARAMETER
 from stagectl.gap.judge import ALIAS_GAIN, ALIAS_SHARE, CURVE_GAIN, EXACT_RATIO, MATERIAL_RATIO, SMOOTH_RATIO, Judge
 from stagectl.gap.kinds import form, has_akin, is_smooth
 from stagectl.gap.normal_equations import Group
@@ -126,6 +127,9 @@ def _simplest(judge: Judge, beside: Sequence[Group], candidates: Sequence[Group]
     now = judge.gain(beside)
     gains = {id(group): judge.gain([*beside, group]) - now for group in candidates}
     best = max(candidates, key=lambda group: gains[id(group)] - judge.price() * form(group))
+    if best.key[1] == PARAMETER:
+        known = [group for group in candidates if group.key[1] == PARAMETER]
+        return max(known, key=lambda group: gains[id(group)] - judge.surprise(beside, group))
     excused = _excused_beside(judge, [*beside, best])
     near = [
         group
