@@ -120,6 +120,25 @@ def test_commands_in_amperes_are_the_same_forces(macro_micro, tmp_path):
         assert np.ptp(one.macro_command_n) > 0.1
 
 
+def test_what_a_loop_swings_at_its_limits_is_left_out(macro_micro, tmp_path):
+    """A clock of 28 ppm made a loop unstable: a search ended with the error of a refused recording (1006014)."""
+    blind, case, _ = macro_micro
+
+    def swinging_from(run, first):
+        samples = run.samples.copy()
+        samples[first:, 3] = 180.0 * np.sign(np.sin(2.0 * np.pi * 100e-3 * np.arange(len(samples) - first) + 0.1))
+        return replace(run, samples=samples)
+
+    runs = [swinging_from(case.runs[0], 200), *case.runs[1:-1], swinging_from(case.runs[-1], 3000)]
+    generate.write(replace(case, runs=runs), tmp_path)
+    cut = load_set(tmp_path)
+    assert [log.name for log in cut.logs] == [log.name for log in blind.logs[1:]]
+    assert cut.gains == blind.gains[1:]
+    assert cut.logs[-1].samples_count == cut.relative_reference_m[-1].size == 3000
+    assert cut.logs[-1].start_s == blind.logs[-1].start_s
+    assert np.array_equal(cut.relative_reference_m[-1], blind.relative_reference_m[-1][:3000])
+
+
 def test_one_axis_has_no_micro_and_its_damping_is_an_effect(single_axis, tmp_path):
     blind, case = written(tmp_path, single_axis)
     assert blind.believed.micro is None
