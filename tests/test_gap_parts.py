@@ -247,6 +247,21 @@ def test_of_a_pitch_the_two_best_places_are_searched_from(name, best):
     assert [group.columns for group in judge.rivals([])] == [best]
 
 
+def test_of_an_error_of_a_sensor_the_other_sensors_is_a_rival_too():
+    """A scale error was told without the other sensor's, which gained least of seven (1007071)."""
+
+    def draw(run, random):
+        columns = random.standard_normal((8, 1000))
+        return [random.standard_normal(1000) + columns.T @ np.linspace(0.8, 0.1, 8), *columns]
+
+    places = ("macro_sensor", "end_sensor")
+    keys = [(name, place) for name in ("thermal_drift", "abbe_error") for place in places]
+    keys += [("backlash_centre_shift", "contact_edge"), ("scale_error", "end_sensor"), ("soft_contact", "contact")]
+    keys += [("scale_error", "macro_sensor")]
+    judge = _table_judge(draw, [Group(key, (k,)) for k, key in enumerate(keys, 1)])
+    assert {group.key for group in judge.rivals([])} == {*keys[:6], keys[7]}
+
+
 def test_of_parameters_that_do_as_well_the_one_that_is_stated_less_well_is_wrong():
     """A push back that is stated exactly was 3.4 % off, and a force constant only its alias (1006005)."""
 
