@@ -229,6 +229,7 @@ def _table_judge(draw, library, *, base=(), training=2, curves=(), runs=3):
     judge = Judge(
         _Table(sums), training, list(base), list(library), lambda _, groups: list(groups),
         lambda _, groups: [0.0] * len(groups), curves=list(curves), threshold=20.0,
+        stated_sds={group.key[0]: 1.0 for group in library if group.key[1] == PARAMETER},
     )  # fmt: skip
     return judge
 
@@ -274,6 +275,7 @@ def test_of_parameters_that_do_as_well_the_one_that_is_stated_less_well_is_wrong
     base = [Group((name, PARAMETER), (column,), prior_sds=(sd,)) for name, sd, column in names]
     loose, exact = (Group((name, PARAMETER), (column + 2,), prior_sds=(1.0,)) for name, _, column in names)
     judge = _table_judge(draw, [loose, exact], base=base)
+    judge.stated_sds = {name: sd for name, sd, _ in names}
     assert judge.gain([exact]) > judge.gain([loose])  # as the hidden one would, but for what is known of it
     assert select(judge) == [loose]
     assert aliases_of(judge, [loose], loose) == []

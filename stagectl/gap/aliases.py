@@ -28,7 +28,7 @@ def aliases_of(judge: Judge, chosen: Sequence[Group], group: Group) -> list[tupl
     rest = [other for other in chosen if other is not group]
     with_it = judge.gain(chosen)
     gained = with_it - judge.gain(rest)
-    left = judge.left_at_most(chosen)
+    left, surprise = judge.left_at_most(chosen), judge.surprise(rest, group)
     margins: dict[tuple[str, str], float] = {}
     taken = {other.key for other in chosen}
     anchors = [moved for moved in judge.anchors_moved(chosen, group) if moved.key not in taken]
@@ -46,8 +46,7 @@ def aliases_of(judge: Judge, chosen: Sequence[Group], group: Group) -> list[tupl
         margin = with_it - judge.gain([*beside, other])
         share = margin / max(gained, 1e-300)
         inexact = margin < left and share < ALIAS_SHARE and _lies_between(margin, apart)
-        is_unlikely = judge.surprise(beside, other) - judge.surprise(rest, group) > ALIAS_GAIN
-        if is_unlikely:
+        if judge.surprise(beside, other) - surprise > ALIAS_GAIN:
             continue
         if apart < ALIAS_GAIN or inexact or _is_rough_friction(judge, group, other, share):
             margins[other.key] = margin

@@ -72,7 +72,7 @@ class Competition:
         known_sds = np.array(self._sds)
         taken = refused | {(effect.name, place) for effect, place, _ in moved}
         grids = grids_for(recordings)
-        wrong = hypotheses.wrong_parameter_terms(recordings[0])
+        wrong = list(hypotheses.wrong_parameter_terms(recordings[0]))
 
         def searched(terms: Iterable[Term]) -> list[Group]:
             return self._taken([term for term in terms if term.name not in without and term.key not in taken])
@@ -86,6 +86,8 @@ class Competition:
         self.judge.curves = self.curves
         self.judge.brought_near = self._brought_near
         self.judge.anchors_moved = self._anchors_moved
+        stated = {term.name: sd for term, sd in self.parameters}
+        self.judge.stated_sds = {term.name: stated[hypotheses.parts_of(term.name)[0]] for term in wrong}
         self.judge.modelled = self._modelled()
         axes = [recordings[0].belief(axis) for axis in recordings[0].axes]
         self.judge.scale_sd_ratio = max(

@@ -74,7 +74,7 @@ def finer_curve_terms(recordings: Sequence[Recording]) -> Iterator[Term]:
 
 
 def unit_of(term: Term) -> str:
-    """Return what the values of a curve are: N of a force, m of a reading or an edge, a ratio of a motor's force."""
+    """Return what the values of a curve are: N of a force, m of a reading or an edge, a ratio of a force or a time."""
     if term.name in (f"curve over {AGO}", f"curve over {LATENESS}"):
         return "ratio"
     return "m" if term.acts_on.endswith(("_sensor", _EDGE, _CENTRE)) else "N"

@@ -113,6 +113,7 @@ class Judge:
     threshold: float = 0.0
     modelled: float = 0.0  # what laws of the model explain already that are inexact, in squares of the noise
     at_size: float = 0.0  # what laws explain that are part of the operating point, in squares of the noise
+    stated_sds: dict[str, float] = field(default_factory=dict)  # of each known parameter that competes
     scale_sd_ratio: float = 0.0  # what masses and force constants are believed to be uncertain by
     is_rough: bool = False  # a force noise besides that of the sensors
     trace: list[str] = field(default_factory=list)
@@ -384,11 +385,10 @@ class Judge:
         By how many of its stated deviations one is off that is wrong nobody knows: twice as many are half as likely. A
         push back that is stated exactly was 3.4 % off, by one square more than a force constant that was.
         """
-        stated = next((one.prior_sds[0] for one in self.base if one.key == group.key), None)
-        if group.key[1] != PARAMETER or stated is None:
+        if group.key[1] != PARAMETER:
             return 0.0
         error = float(solve([*self.base, *beside, group], self.source.sums).of(group)[0][0])
-        return 2.0 * math.log(max(abs(error) / stated, 1.0))
+        return 2.0 * math.log(max(abs(error) / self.stated_sds[group.key[0]], 1.0))
 
     def left_at_most(self, chosen: Sequence[Group]) -> float:
         """Return what is left above the floor at most, in squares of the noise.

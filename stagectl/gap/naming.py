@@ -198,13 +198,12 @@ def _readable(term: Term, solution: Solution, group: Group) -> tuple[dict[str, f
 
 def parameter_errors(search: Competition, chosen: list[Group], solution: Solution) -> tuple[ParameterError, ...]:
     """Return the known parameters that competed with the effects and stayed, each with what would do as well."""
-    stated = {term.name: sd for term, sd in search.parameters}
     found = []
     for group in chosen:
         term = search.term(group)
         if term.acts_on == "parameter":
             values, sds = solution.of(group)
-            own = stated[hypotheses.parts_of(term.name)[0]]
+            own = search.judge.stated_sds[term.name]
             aliases = tuple(key[0] for key, _ in aliases_of(search.judge, chosen, group) if key[1] == "parameter")
             found.append(ParameterError(term.name, float(values[0]), float(sds[0]), own, aliases))
     return tuple(found)
