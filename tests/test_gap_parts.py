@@ -25,7 +25,8 @@ from stagectl.gap.innovations import moments
 from stagectl.gap.judge import FLOOR_VARIANCE, Judge
 from stagectl.gap.left_over import excess, finer_curve, one_curve_for_many, unknown_rest
 from stagectl.gap.log import Log, log_of_rows
-from stagectl.gap.looks import Look, _has_reached_floor
+from stagectl.gap.looks import Look, _as_of_exact_laws, _has_reached_floor
+from stagectl.gap.naming import all_named
 from stagectl.gap.noise import noise_of, slow_noise
 from stagectl.gap.normal_equations import Fold, Group, Sums, solve
 from stagectl.gap.selection import lacks_a_name, select
@@ -618,11 +619,13 @@ def _axis_log(
     growing_n: float = 0.0,
     late_ratio: float = 0.0,
     bent_m: float = 0.0,
+    uneven_n: float = 0.0,
 ) -> Log:
     """An axis under a spring-like controller of its own, with forces that nobody is told of.
 
     friction_n: dry; ripple_n: over 4.36 mm, an eleventh of the way; growing_n: dry, within 0.1 s of each reversal;
-    late_ratio: of a period, by which commands act later; bent_m: what is read too much 20 mm from the middle.
+    late_ratio: of a period, by which commands act later; bent_m: what is read too much 20 mm from the middle;
+    uneven_n: by how much more friction there is forward, and less backward.
     """
     random = np.random.default_rng(seed)
     parts = 20
@@ -639,7 +642,8 @@ def _axis_log(
         command[k] = 4.0e4 * (reference[k] - seen[k]) + 2.5e3 * (speed[k] - v)
         for part in range(parts):
             x += 0.5 * v * H / parts
-            hidden = dry_n * math.tanh(v / 1e-4) + ripple_n * math.sin(1441.0 * x)
+            sign = math.tanh(v / 1e-4)
+            hidden = dry_n * sign + uneven_n * sign * sign + ripple_n * math.sin(1441.0 * x)
             acting_n = command[k] if k == 0 or part >= late_ratio * parts else command[k - 1]
             v += (acting_n - hidden - 30.0 * v + slow[k]) / MASS * H / parts
             x += 0.5 * v * H / parts
@@ -806,11 +810,35 @@ def test_a_look_above_more_noise_does_not_say_that_nothing_is_left():
     assert not _has_reached_floor(quieter, look, {"gain": 500.0, "left": 21700.0})
 
 
-def _look(recordings, noise) -> Look:
+@pytest.mark.parametrize(("force_n", "count"), [(0.256, 1), (0.064, 2), (0.0, 2)])
+def test_nothing_is_named_above_a_force_noise_that_was_a_friction(force_n, count):
+    """Above it, less is left than noise; what else there is, a closer look names above the noise that there is."""
+    recordings = [balance.recording_of(_axis_log("run 1", 1.0, 1, ripple_n=0.05), _believed())]
+    (level,) = slow_noise(_believed(), recordings[0]).values()
+    look = _look(recordings, {"macro": dataclasses.replace(level, white_force_n=force_n)})
+    names = [("coulomb_friction", "macro_force"), ("cogging", "macro_force")]
+    assert look.search.judge.has_named_noise(look.chosen) == (count == 1)
+    assert [group.key for group in select(look.search.judge)] == names[:count]
+
+
+def test_frictions_are_no_aliases_above_a_force_noise_that_there_is_not():
+    """Of a rough machine no friction is exact, and one with 1.4 % less gain does as well; of others it does not."""
+    recordings = [balance.recording_of(_axis_log("run 1", 1.0, 1, uneven_n=0.12), _believed())]
+    (level,) = slow_noise(_believed(), recordings[0]).values()
+    look = _look(recordings, {"macro": dataclasses.replace(level, white_force_n=0.016)}, "asymmetric_coulomb_friction")
+    (told,) = all_named(look.search, look.chosen)
+    symmetric = ("coulomb_friction", "macro_force")
+    assert symmetric in {alias[:2] for alias in told.aliases}
+    (of_exact,) = _as_of_exact_laws(look._replace(named=(told,))).named
+    assert symmetric not in {alias[:2] for alias in of_exact.aliases}
+    assert of_exact.parameters == told.parameters
+
+
+def _look(recordings, noise, name: str = "coulomb_friction") -> Look:
     search = Competition(recordings, 1, noise=noise)
     search.judge.threshold = 30.0
     friction = max(
-        (group for group in search.judge.library if group.key == ("coulomb_friction", "macro_force")),
+        (group for group in search.judge.library if group.key == (name, "macro_force")),
         key=lambda group: search.judge.gain([group]),
     )
     return Look(search, [friction], ())

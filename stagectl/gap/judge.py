@@ -398,6 +398,15 @@ class Judge:
         """
         return max(_above_floor(self.source.sums) - self.gain(chosen), 0.0) + self._floor_scatter()
 
+    def has_named_noise(self, chosen: Sequence[Group]) -> bool:
+        """Tell whether what has a name now was taken for force noise: less is left than the floor.
+
+        Above noise that is not there innovations are no longer independent, and what turns phases gains by that: beside
+        a friction of 32 mN of force noise, of which 17 600 squares too few were left, a mode at 34 Hz gained 286.
+        """
+        left = _above_floor(self.source.sums) - self.gain(chosen)
+        return self.is_rough and left < -self._floor_scatter()
+
     def _floor_scatter(self) -> float:
         """Return what may be left by the noise alone, in squares of it."""
         return LEFT_SDS * float(np.sqrt(2.0 * sum(s.count for s in self.source.sums)))

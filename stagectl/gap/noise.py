@@ -25,6 +25,10 @@ _STRETCH = 512
 _LOW, _HIGH = (0.06, 0.2), (0.3, 0.5)  # shares of the sample rate
 _WHITE_RATIO = 1.08
 
+_LOWER = (0.02, 0.06)
+"""Where force noise shows most, and where no more is believed of it than there is: a body without any that was 1.09
+times as loud at `_LOW` was given 32 mN, above which it had 0.1 of its power here."""
+
 _PASSED, _STOPPED = (0.2, 0.3), (0.4, 0.5)  # shares of the sample rate
 _STOPPED_RATIO = 0.2
 """Of a position's noise between the latter, to that between the former, below which it was low-passed: sensors make 1,
@@ -65,7 +69,8 @@ def noise_of(
             high = _FORCES_N.index(at_most[axis].white_force_n)
         while low < high:  # the ratio falls with the force noise that the filter expects
             middle = (low + high) // 2
-            if _redness(*asked_of, axis, replace(level, white_force_n=_FORCES_N[middle])) <= _WHITE_RATIO:
+            at_middle, lower = _redness(*asked_of, axis, replace(level, white_force_n=_FORCES_N[middle]))
+            if at_middle <= _WHITE_RATIO or lower <= 1.0:
                 high = middle
             else:
                 low = middle + 1
@@ -101,8 +106,8 @@ def scale_of(left: np.ndarray, low_passed: bool) -> float:
     return float(np.sqrt(np.mean(power[np.fft.rfftfreq(left.size) > _HIGH[0]])))
 
 
-def _redness(recordings: Sequence[Recording], forces: Sequence[Forces], axis: str, level: Noise) -> float:
-    """Return the innovations' power at middle over that at high frequencies, in the middle one of all stretches."""
+def _redness(recordings: Sequence[Recording], forces: Sequence[Forces], axis: str, level: Noise) -> tuple[float, float]:
+    """Return the power of innovations at middle and at lower frequencies over that at high ones, in the middle stretch."""
     ratios = []
     for recording, more in zip(recordings, forces, strict=True):
         balance.set_noise(recording, {name: level for name in recording.axes})
@@ -110,8 +115,11 @@ def _redness(recordings: Sequence[Recording], forces: Sequence[Forces], axis: st
         if z.size < _STRETCH:
             continue
         high = 1.0 if is_low_passed(recording, axis) else np.maximum(_power(z, _HIGH), 1e-300)
-        ratios.append(_power(z, _LOW) / high)
-    return float(np.median(np.concatenate(ratios))) if ratios else 0.0
+        ratios.append(np.stack([_power(z, band) / high for band in (_LOW, _LOWER)], axis=1))
+    if not ratios:
+        return 0.0, 0.0
+    middle, lower = np.median(np.concatenate(ratios), axis=0)
+    return float(middle), float(lower)
 
 
 def _power(values: np.ndarray, band: tuple[float, float]) -> np.ndarray:

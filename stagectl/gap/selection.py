@@ -41,7 +41,7 @@ def select(
         chosen = grown
         chosen = _without_superfluous(judge, _competed(judge, chosen))
         state = frozenset(group.key for group in chosen)
-        if state in seen or any(until(group) for group in chosen):
+        if state in seen or any(until(group) for group in chosen) or judge.has_named_noise(chosen):
             break
         seen.add(state)
     return as_one(judge, in_parts(judge, _beside_other_shapes(judge, chosen)))
