@@ -63,7 +63,7 @@ def _dahl_loses(search: Competition) -> tuple[float, float]:
     return less, less / gains["lugre_friction"]
 
 
-@pytest.mark.parametrize("anchor_m", [0.02, 0.25, -3.0])
+@pytest.mark.parametrize("anchor_m", [0.02, 0.25, -0.45])
 def test_a_cable_is_found_wherever_its_anchor_is(anchor_m):
     """From the middle of the travel alone, one whose anchor lay beside it was the offset that it mostly is."""
     search = _search(_pulled_by(60.0, anchor_m))
@@ -71,6 +71,12 @@ def test_a_cable_is_found_wherever_its_anchor_is(anchor_m):
     term = search.term(found)
     assert term.name == "cable_spring"
     assert term.shape["anchor_m"] == pytest.approx(anchor_m, rel=0.02)
+
+
+def test_an_offset_and_a_spring_are_no_cable_from_beyond_the_travel():
+    """An offset and a cubic stiffness were one that was anchored 0.9 m away, beside a travel of 1 m (2997)."""
+    search = _search(_pulled_by(60.0, -3.0))
+    assert sorted(group.key[0] for group in select(search.judge)) == ["linear_stiffness", "offset"]
 
 
 def test_an_offset_and_a_spring_are_one_cable():

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from bench import left_out
-from bench.left_out import farthest_singles, is_right, is_together, without
+from bench.left_out import Asked, Single, asked, farthest_singles, is_right, is_together, without
 from tests.blind import detection, draw, together
 from tests.marks import found, member, one
 
@@ -53,11 +53,34 @@ def test_an_effect_is_left_out_of_the_set_that_no_other_law_comes_near():
     below = single(7, "offset", [])
     below.searched.truth["effects"][0]["above_twice_limit"] = False
     truths = [marked.searched.truth for marked in [*sets, below]]
-    assert farthest_singles(truths) == {
-        "sensor_delay": (38.3, 2, "macro_force"),
-        "coulomb_friction": (12.0, 4, "macro_force"),
-        "scale_error": (54.0, 8, "macro_sensor"),
+    assert farthest_singles(truths, 2) == {
+        "sensor_delay": [Single(38.3, 2, "macro_force", (*lag,)), Single(9.3, 1, "macro_force", (*lag,))],
+        "coulomb_friction": [Single(12.0, 4, "macro_force", (*mass,))],
+        "scale_error": [Single(54.0, 8, "macro_sensor", (*mass,)), Single(40.0, 9, "macro_sensor", (*mass,))],
     }
+
+
+def test_an_effect_is_asked_of_the_set_that_no_two_laws_come_near():
+    """Further sets only where two laws leave of those before what a floor may hide."""
+
+    def singles(*distances):
+        return [Single(d, round(d), "macro_force", ("offset", "macro_force")) for d in distances]
+
+    of_two = {144: 9.1, 130: 25.0, 120: 24.0, 90: 71.0, 80: 80.0, 50: 6.0, 49: 6.0}
+    were_asked = []
+
+    def distances_of(some):
+        were_asked.extend(one.seed for one in some)
+        return [of_two[one.seed] for one in some]
+
+    of_effects = {"tilt": singles(144, 130, 120), "lugre_friction": singles(90, 80), "sensor_lag": singles(50, 49)}
+    assert asked(of_effects, distances_of) == {
+        "tilt": Asked(130, "macro_force", 25.0),
+        "lugre_friction": Asked(90, "macro_force", 71.0),
+        "sensor_lag": Asked(50, "macro_force", 6.0),
+    }
+    assert sorted(were_asked) == [49, 50, 90, 120, 130, 144]
+    assert asked({}, distances_of) == {}
 
 
 def test_the_share_of_right_answers_is_held_against_its_bar():
@@ -69,15 +92,13 @@ def test_the_share_of_right_answers_is_held_against_its_bar():
     assert left_out.judged([], [], full=True).value is None
 
 
-def test_where_the_nearest_law_leaves_less_than_the_floor_scatters_by_no_rest_is_asked_for():
-    def single(seed, distance):
-        return one(seed, "single", (), member() | {"nearest": [["mass_error", "macro_force", distance]]}, sd=100.0)
-
-    near, far, farther = single(1, 22.0), single(2, 24.0), single(3, 300.0)
-    figure = left_out.judged_shown([near, far, farther], [False, False, True], full=True)
+def test_where_two_laws_leave_less_than_the_floor_scatters_by_no_rest_is_asked_for():
+    distances = {1: 22.0, 2: 24.0, 3: 300.0}
+    near, far, farther = (one(seed, "single", (), member(), sd=100.0) for seed in distances)
+    figure = left_out.judged_shown([near, far, farther], [False, False, True], distances, full=True)
     assert (figure.value, figure.holds, figure.seeds) == (pytest.approx(50.0), None, [2, 3])
     assert "1 others" in figure.reason
-    assert left_out.judged_shown([near], [True], full=True).value is None
+    assert left_out.judged_shown([near], [True], distances, full=True).value is None
 
 
 # ---- laws that are together another one ------------------------------------------------------------------------------
@@ -98,6 +119,14 @@ def test_two_offsets_are_a_tilt_and_one_is_not(tilted):
     alone = together.distance(tilted, [])
     assert together.distance(tilted, told("offset@macro_force", "offset@micro_force")) < 1e-3 * alone
     assert detection.SEPARABLE_D < together.distance(tilted, told("offset@macro_force")) < alone
+
+
+def test_the_two_laws_that_come_nearest_are_found(tilted):
+    """Beside an offset of the macro nothing is nearer to a tilt than one of the micro, or a cable far away there."""
+    first = ("offset", "macro_force")
+    assert together.distance_of_two(tilted, first, lambda name, _: name != "tilt") < detection.SEPARABLE_D
+    none_left = together.distance_of_two(tilted, first, lambda name, acts_on: name == "clock_skew")
+    assert detection.SEPARABLE_D < none_left <= together.distance(tilted, told("offset@macro_force"))
 
 
 def test_a_cable_that_is_anchored_far_away_is_an_offset(tilted):

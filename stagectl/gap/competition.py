@@ -24,7 +24,6 @@ from stagectl.gap.refinement import (
     but_for_size,
     counts_at_size,
     gain_at_size,
-    nearest_place,
     refined,
     searched_count,
     with_shape,
@@ -165,14 +164,9 @@ class Competition:
         return self._finer
 
     def _brought_near(self, other: Group, group: Group) -> list[Group]:
-        """Return a law at the shapes at which it may be what `group` says.
-
-        What acts about a place is no farther from the travel than the grid has it beside it; the same law elsewhere may
-        have the same shape.
-        """
+        """Return a law at the shapes that may say what `group` says: its own, and that of the same law elsewhere."""
         term, named = self.term(other), self.term(group)
-        near = nearest_place(self.evidence.recordings, term)
-        found = [other] if near is term else self._appended([near], other)
+        found = [other]
         if term.name == named.name and term.linear == named.linear:
             size, shape = CATALOGUE[term.name].parameters[0], named.shape
             if size in shape:  # what one reads too much the other reads too little

@@ -167,6 +167,7 @@ _QUANTITIES = {
     "since_reversal_s": (1.0, "time since the last reversal (s)"),
     "motor_force_ago_s": (1e3, "time since the motor's force (ms)"),
     "lateness_s": (1e3, "how late the reading is (ms)"),
+    "mass_kg": (1.0, "mass with what is carried (kg)"),
     "penetration_velocity_m_per_s": (1e3, "closing speed in contact (mm/s)"),
 }
 

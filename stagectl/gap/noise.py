@@ -107,7 +107,7 @@ def scale_of(left: np.ndarray, low_passed: bool) -> float:
 
 
 def _redness(recordings: Sequence[Recording], forces: Sequence[Forces], axis: str, level: Noise) -> tuple[float, float]:
-    """Return the power of innovations at middle and at lower frequencies over that at high ones, in the middle stretch."""
+    """Return the power of innovations at middle and at lower frequencies over that at high ones, typically."""
     ratios = []
     for recording, more in zip(recordings, forces, strict=True):
         balance.set_noise(recording, {name: level for name in recording.axes})

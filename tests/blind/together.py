@@ -31,11 +31,39 @@ def distance(case, named):
     told of it, near which is looked as well. A law has any amount of what its force is linear in (its amplitude, an
     anchor, an asymmetry); its other parameters are followed from the best point of its grid to where they come nearest.
     """
-    evidence = detection.Evidence(case, case.runs).narrowed(detection.SEPARATION_BAND_HZ)
-    signal = evidence.effect_column(0)
+    evidence, signal = _seen(case)
     members = [_member(evidence, name, acts_on, case.effects) for name, acts_on, _ in named]
     if not all(members):
         return math.inf
+    rest = _rest(evidence, signal, members)
+    nearest = min((_settled(rest, members, start) for start in _starts(rest, members)), key=rest, default=[])
+    told = [member.told(point, values) for member, point, (*_, values) in zip(members, nearest, named, strict=True)]
+    return min(_followed(rest, members, start)[0] for start in (nearest, told))
+
+
+def distance_of_two(case, first, stands):
+    """Distance d of the one hidden effect from a law and the one that comes nearest beside it, followed together.
+
+    first: (name, acts_on) of the law; stands(name, acts_on) tells which others there are.
+    """
+    evidence, signal = _seen(case)
+    member = _member(evidence, *first, case.effects)
+    rest = _rest(evidence, signal, [member])
+    alone, (point,) = _followed(rest, [member], [min(member.points, key=lambda one: rest([one]))])
+    evidence.set_nuisance(member.columns(point))
+    beside = {key: d for key, d in evidence.distances(signal, case.effects).items() if key != first and stands(*key)}
+    second = min(beside, key=beside.get)
+    return min(alone, beside[second], distance(case, [(*first, {}), (*second, {})]))
+
+
+def _seen(case):
+    """What is seen of a case, below where laws are told apart, and of its one hidden effect."""
+    evidence = detection.Evidence(case, case.runs).narrowed(detection.SEPARATION_BAND_HZ)
+    return evidence, evidence.effect_column(0)
+
+
+def _rest(evidence, signal, members):
+    """What points of some laws leave of a signal; a law without a point is not there."""
 
     def rest(points):
         present = [(member, point) for member, point in zip(members, points, strict=True) if point is not None]
@@ -43,9 +71,7 @@ def distance(case, named):
             signal, [column for member, point in present for column in member.columns(point)], True
         )
 
-    nearest = min((_settled(rest, members, start) for start in _starts(rest, members)), key=rest, default=[])
-    told = [member.told(point, values) for member, point, (*_, values) in zip(members, nearest, named, strict=True)]
-    return min(_followed(rest, members, start) for start in (nearest, told))
+    return rest
 
 
 class Member:
@@ -122,23 +148,27 @@ def _settled(rest, members, start):
 
 
 def _followed(rest, members, start):
-    """Distance where the followed parameters, from a start on, come nearest."""
+    """(distance, points) where the followed parameters, from a start on, come nearest."""
     places = [(place, parameter) for place, member in enumerate(members) for parameter in member.followed]
     if not places:
-        return rest(start)
+        return rest(start), start
     first = [start[place][parameter.name] for place, parameter in places]
 
-    def at(logs):
+    def moved(logs):
         points = [dict(point) for point in start]
         for (place, parameter), own, log in zip(places, first, logs, strict=True):
             points[place][parameter.name] = math.copysign(math.exp(log), own)
-        return rest(points)
+        return points
 
     bounds = [(math.log(p.low / BEYOND), math.log(p.high * BEYOND)) for _, p in places]
     begin = np.clip(np.log(np.abs(first)), *np.transpose(bounds))
     simplex = np.vstack([begin, begin + FIRST_STEP * np.eye(len(begin))])
     rounds = {"maxfev": ROUNDS_COUNT * len(begin), "xatol": FIRST_STEP * 1e-3, "fatol": TOLERANCE_D}
     near = optimize.minimize(
-        at, begin, method="Nelder-Mead", bounds=bounds, options={"initial_simplex": simplex, **rounds}
+        lambda logs: rest(moved(logs)),
+        begin,
+        method="Nelder-Mead",
+        bounds=bounds,
+        options={"initial_simplex": simplex, **rounds},
     )
-    return float(near.fun)
+    return float(near.fun), moved(near.x)
