@@ -780,6 +780,24 @@ def test_a_lag_in_a_delays_place_is_spread_out(name, parameter, tmp_path):
     assert (found and found.key) == (spread.key if name == "sensor_delay" else None), search.judge.trace
 
 
+@pytest.mark.parametrize("hidden", ["tilt", "offset"])
+def test_a_tilt_in_two_offsets_place_grows_with_what_is_carried(hidden, tmp_path):
+    """To a library without tilts one of 1 mrad was an offset of each body, but for 83 squares of 76 600 (1008009)."""
+    case = generate.draw(1008009, "single", 6.0)
+    assert len({run.payload_kg for run in case.runs}) > 1
+    slope = {"tilt": {"angle_rad": 2e-3}, "offset": {"force_n": 0.9}}[hidden]
+    case.effects = [draw.Effect(laws.BY_NAME[hidden], "macro_force", slope)]
+    case.runs = draw.simulate(case)
+    generate.write(case, tmp_path)
+    blind = load_set(tmp_path)
+    recordings = [balance.recording_of(log, blind.believed) for log in blind.logs]
+    search = Competition(recordings, len(recordings), noise=noise_of(recordings))
+    offsets = [group for group in search.judge.library if group.key[0] == "offset"]
+    found = finer_curve(search, offsets, 0.0)
+    load = ("curve over mass_kg", "micro_force")
+    assert (found and found.key) == (load if hidden == "tilt" else None), search.judge.trace
+
+
 def test_what_moved_a_joint_and_is_nothing_at_its_size_is_not_told(tmp_path):
     """Without a law of soft contacts a search ended with an error that named nothing (3087)."""
     generate.write(generate.draw(3197, "single", 2.0), tmp_path)
