@@ -47,18 +47,20 @@ class FinalRun:
     record: Path
     number: int
     journal: Journal
+    _others: list[Journal] = dataclasses.field(default_factory=list)
 
     def keep(self, one: Searched) -> None:
         """Keep what was found on one set, so that a run that is cut short need not search it again."""
-        entry = dataclasses.asdict(one)
-        self.journal.keep(entry.pop("seed"), entry)
+        self.journal.keep(*entry_of(one))
 
     def kept(self) -> dict[int, Searched]:
         """Return what was found before this run was cut short."""
-        return {
-            seed: Searched(seed=seed, **{**entry, "reducible": tuple(entry["reducible"])})
-            for seed, entry in self.journal.entries.items()
-        }
+        return {seed: searched_of(seed, entry) for seed, entry in self.journal.entries.items()}
+
+    def journal_of(self, what: str) -> Journal:
+        """Return where something else of this run is kept, until it ends."""
+        self._others.append(Journal(_journal(self.record, f"{self.number}-{what}")))
+        return self._others[-1]
 
     def end(self, seeds: Iterable[int], figures: Iterable[Figure], took_s: float) -> None:
         """Write the result into the record."""
@@ -73,7 +75,19 @@ class FinalRun:
             "figures": [figure.as_json() | {"seeds": []} for figure in figures],
         }
         _write(self.record, content)
-        self.journal.end()
+        for journal in (self.journal, *self._others):
+            journal.end()
+
+
+def entry_of(one: Searched) -> tuple[int, dict[str, Any]]:
+    """Return the seed of a searched set, and what a journal keeps of it."""
+    entry = dataclasses.asdict(one)
+    return entry.pop("seed"), entry
+
+
+def searched_of(seed: int, entry: dict[str, Any]) -> Searched:
+    """Return a searched set as a journal has it."""
+    return Searched(seed=seed, **{**entry, "reducible": tuple(entry["reducible"])})
 
 
 def begin(record: Path = RECORD) -> FinalRun:
@@ -92,8 +106,8 @@ def begin(record: Path = RECORD) -> FinalRun:
     return FinalRun(record, number, Journal(_journal(record, number)))
 
 
-def _journal(record: Path, number: int) -> Path:
-    return record.with_name(f"{record.stem}-run-{number}.jsonl")
+def _journal(record: Path, name: int | str) -> Path:
+    return record.with_name(f"{record.stem}-run-{name}.jsonl")
 
 
 def _read(record: Path) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from bench.blind_sets import (
     sets_folder,
 )
 from bench.figure import Bar, Figure, absent, judged
+from bench.journal import measured
 from stagectl.gap.believed import Believed
 from stagectl.gap.crew import crew_of
 from stagectl.gap.heap import give_back, keep_freed
@@ -136,14 +137,15 @@ def _full(say: Say) -> Iterator[Figure]:
         _search_all([Job(seed, "null", sets_folder(), keep=False) for seed in seeds], run, done, say)
     found = [marked(done[seed]) for seed in sorted(done)]
     say(f"{FULL_SINGLES_COUNT} more sets with one effect are drawn: of each law one may show better that it is missing")
-    more = left_out.drawn_truths(range(end, end + FULL_SINGLES_COUNT))
-    measured = [
+    drawn = measured(run.journal_of("truths"), range(end, end + FULL_SINGLES_COUNT), left_out.drawn_truths)
+    truths = [*_truths(found), *(truth for _, truth in sorted(drawn))]
+    results = [
         *suite_figures.suite(found, full=True),
-        *left_out.figures([*_truths(found), *more], True, say, None, float("inf")),
+        *left_out.figures(truths, True, say, None, float("inf"), run.journal_of),
         *suite_figures.effect_by_effect(found),
     ]
-    run.end(done, measured, time.monotonic() - begin_s)
-    yield from measured
+    run.end(done, results, time.monotonic() - begin_s)
+    yield from results
 
 
 def _search_all(jobs: Sequence[Job], run: final_seeds.FinalRun, done: dict[int, Searched], say: Say) -> None:

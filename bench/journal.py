@@ -1,6 +1,7 @@
 """A journal of a long measurement: what was measured with these sources is not measured again."""
 
 import json
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -38,3 +39,15 @@ class Journal:
         """Remove the file: what it was for is done."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
+
+
+def measured(
+    journal: Journal, seeds: Iterable[int], measure: Callable[[list[int]], Iterable[tuple[int, dict[str, Any]]]]
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield (seed, entry) of seeds: first what is kept, then what `measure` yields of the others, kept as it comes."""
+    wanted = list(seeds)
+    open_ones = [seed for seed in wanted if seed not in journal.entries]
+    yield from [(seed, journal.entries[seed]) for seed in wanted if seed in journal.entries]
+    for seed, entry in measure(open_ones) if open_ones else ():
+        journal.keep(seed, entry)
+        yield seed, entry

@@ -4,6 +4,7 @@ Right is "unknown", or what nobody can tell from the hidden law: an alias of it,
 or laws that are together what it is, by the generator's own measure.
 """
 
+import functools
 import itertools
 import json
 import multiprocessing
@@ -16,6 +17,8 @@ from bench import suite_figures
 from bench.blind_names import our_keys
 from bench.blind_sets import DURATION_S, Job, Marked, line, marked, searched, sets_folder
 from bench.figure import Bar, Figure, absent
+from bench.final_seeds import entry_of, searched_of
+from bench.journal import Journal, measured
 from tests.blind import detection, generate, together
 
 BAR = Bar("effect taken out of the library: unknown, or its stated alias", "%", 100.0, at_least=True)
@@ -115,9 +118,16 @@ def asked(
     return found
 
 
-def _distances_of(singles: list[Single]) -> list[float]:
-    with ProcessPoolExecutor(os.cpu_count() or 1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return list(pool.map(_distance_of_two, singles))
+def _distances_of(journal: Journal, singles: list[Single]) -> list[float]:
+    by_seed = {single.seed: single for single in singles}
+
+    def measure(seeds: list[int]) -> Iterator[tuple[int, dict[str, Any]]]:
+        with ProcessPoolExecutor(os.cpu_count() or 1, mp_context=multiprocessing.get_context("spawn")) as pool:
+            distances = pool.map(_distance_of_two, [by_seed[seed] for seed in seeds])
+            yield from ((seed, {"distance": d}) for seed, d in zip(seeds, distances, strict=True))
+
+    found = dict(measured(journal, by_seed, measure))
+    return [found[single.seed]["distance"] for single in singles]
 
 
 def _distance_of_two(single: Single) -> float:
@@ -128,10 +138,10 @@ def _distance_of_two(single: Single) -> float:
     return together.distance_of_two(case, single.nearest, lambda name, acts_on: remains(gone, name, acts_on))
 
 
-def drawn_truths(seeds: Iterable[int]) -> list[dict[str, Any]]:
-    """Return the truths of further sets that hide one effect each, of which nothing has been searched."""
+def drawn_truths(seeds: Sequence[int]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield (seed, truth) of further sets that hide one effect each, of which nothing has been searched."""
     with ProcessPoolExecutor(os.cpu_count() or 1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return list(pool.map(_drawn_truth, seeds))
+        yield from zip(seeds, pool.map(_drawn_truth, seeds), strict=True)
 
 
 def _drawn_truth(seed: int) -> dict[str, Any]:
@@ -139,20 +149,31 @@ def _drawn_truth(seed: int) -> dict[str, Any]:
 
 
 def figures(
-    truths: Iterable[dict[str, Any]], full: bool, say: Callable[[str], None], most: int | None, until_s: float
+    truths: Iterable[dict[str, Any]],
+    full: bool,
+    say: Callable[[str], None],
+    most: int | None,
+    until_s: float,
+    journal_of: Callable[[str], Journal] = lambda what: Journal(None),
 ) -> Iterator[Figure]:
     """Search the set of every effect that shows best that it is missing, with a library that lacks the effect."""
     singles = farthest_singles(truths, _FULL_SETS_COUNT if full else 1)
     say(f"how near two laws together come to each of {len(singles)} effects, of the sets that no other law comes near")
-    sets = asked(dict(list(singles.items())[:most]), _distances_of)
-    jobs = [
-        Job(one.seed, "single", sets_folder(), keep=not full, options=(("without", without(name, one.acts_on)),))
+    sets = asked(dict(list(singles.items())[:most]), functools.partial(_distances_of, journal_of("distances")))
+    jobs = {
+        one.seed: Job(
+            one.seed, "single", sets_folder(), keep=not full, options=(("without", without(name, one.acts_on)),)
+        )
         for name, one in sets.items()
-    ]
+    }
     distances = {one.seed: one.distance for one in sets.values()}
     say(f"the library without one effect, {len(jobs)} times")
     again, right = [], []
-    for one in searched(jobs, os.cpu_count() or 1, until_s):
+
+    def search(seeds: list[int]) -> Iterator[tuple[int, dict[str, Any]]]:
+        return map(entry_of, searched([jobs[seed] for seed in seeds], os.cpu_count() or 1, until_s))
+
+    for one in itertools.starmap(searched_of, measured(journal_of("left-out"), jobs, search)):
         again.append(marked(one))
         right.append(is_right(again[-1]) or is_together(again[-1]))
         said = "unknown or an alias" if right[-1] else "MISNAMED or missed"

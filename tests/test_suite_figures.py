@@ -13,6 +13,7 @@ from scipy import stats
 from bench import final_seeds, suite_figures
 from bench.blind_sets import Searched, marked
 from bench.figure import Bar
+from bench.journal import Journal, measured
 from bench.sources import ROOT, gap_sources
 from bench.suite_figures import (
     coverage_figure,
@@ -156,6 +157,8 @@ def test_final_seeds_are_counted_before_they_are_run_and_a_run_cut_short_goes_on
     again = final_seeds.begin(record)  # it was cut short: no second run
     assert again.number == 1
     assert again.kept() == {1_000_000: row}
+    again.journal_of("truths").keep(1_000_001, {"kind": "single"})
+    assert final_seeds.begin(record).journal_of("truths").entries == {1_000_001: {"kind": "single"}}
     bar = Bar("x", "%", 2.0)
     again.end([1_000_000], [judged_estimate(bar, share(1, 10), [1_000_000], full=True)], 3.0)
     content = json.loads(record.read_text())
@@ -170,6 +173,21 @@ def test_final_seeds_are_counted_before_they_are_run_and_a_run_cut_short_goes_on
     monkeypatch.setattr(final_seeds, "gap_hash", lambda: "other")
     assert final_seeds.begin(record).number == 3
     assert json.loads(record.read_text())["final_seeds_were_run"] == 3
+
+
+def test_what_is_kept_is_not_measured_again(tmp_path):
+    path, were_measured = tmp_path / "kept.jsonl", []
+
+    def measure(seeds):
+        for seed in seeds:
+            were_measured.append(seed)
+            yield seed, {"distance": 0.5 * seed}
+
+    first = measured(Journal(path), [4, 6], measure)
+    assert next(first) == (4, {"distance": 2.0})  # and cut short
+    assert list(measured(Journal(path), [6, 4, 8], measure)) == [(seed, {"distance": 0.5 * seed}) for seed in (4, 6, 8)]
+    assert list(measured(Journal(path), [8], measure)) == [(8, {"distance": 4.0})]
+    assert were_measured == [4, 6, 8]
 
 
 def test_a_result_of_the_gap_depends_on_what_it_imports_and_on_nothing_else():
