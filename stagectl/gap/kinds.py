@@ -50,6 +50,19 @@ def is_friction(group: Group) -> bool:
     return known is not None and not known.origin and (known.has_step or shows_at_low_speed(group))
 
 
+def act_apart(one: Group, other: Group) -> bool:
+    """Tell whether two laws push different bodies, of which no motor pushes the other one back.
+
+    Where the joint touches goes by readings: what a law of the macro is inexact by leaves nothing in the end's motion.
+    The micro's motor pushes the macro, too.
+    """
+    bodies = {_PUSHED.get(group.key[1]) for group in (one, other)}
+    return bodies == {"macro", "micro"}
+
+
+_PUSHED = {"macro_force": "macro", "macro_actuator": "macro", "macro_command": "macro", "micro_force": "micro"}
+
+
 def shows_at_low_speed(group: Group) -> bool:
     known = CATALOGUE.get(group.key[0])
     return known is not None and known.shown_by == "low speed"
