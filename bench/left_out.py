@@ -87,7 +87,7 @@ def remains(gone: frozenset[str], name: str, acts_on: str) -> bool:
 
 
 class Asked(NamedTuple):
-    """The set that an effect is asked of, and how near two of the laws that remain come to it together."""
+    """The set that an effect is asked of, and how near laws that would be a wrong answer come to it."""
 
     seed: int
     acts_on: str
@@ -97,12 +97,13 @@ class Asked(NamedTuple):
 def asked(
     singles: dict[str, list[Single]], distances_of: Callable[[list[Single]], Iterable[float]]
 ) -> dict[str, Asked]:
-    """Return the set of every effect that no two laws that remain come near together, of those given.
+    """Return the set of every effect, of those given, that no wrong answer of one or two laws comes near.
 
     distances_of: gives how near two laws come to each of some singles. A tilt that no law came nearer than 144
     deviations was two offsets but for 9, a scale error a bow of the path and a drift but for 7, of 43: what is left so
-    is nothing that a floor shows, which scatters by 28 deviations squared. Of the further sets of an effect is asked
-    only where what two laws leave of those before doesn't stand out of any floor.
+    is nothing that a floor shows, which scatters by 28 deviations squared. Two laws that are the hidden one by the
+    generator's own measure are no wrong answer; there one law alone is. Of the further sets of an effect is asked only
+    where what is left of those before doesn't stand out of any floor.
     """
     found: dict[str, Asked] = {}
     for place in range(max(map(len, singles.values()), default=0)):
@@ -111,10 +112,11 @@ def asked(
             for name, some in singles.items()
             if place < len(some) and (name not in found or found[name].distance < _ENOUGH_D)
         ]
-        for name, distance in zip(names, distances_of([singles[name][place] for name in names]), strict=True):
-            _, seed, acts_on, _ = singles[name][place]
-            if name not in found or distance > found[name].distance:
-                found[name] = Asked(seed, acts_on, distance)
+        for name, of_two in zip(names, distances_of([singles[name][place] for name in names]), strict=True):
+            single = singles[name][place]
+            wrong = of_two if of_two >= detection.SEPARABLE_D else single.distance
+            if name not in found or wrong > found[name].distance:
+                found[name] = Asked(single.seed, single.acts_on, wrong)
     return found
 
 
@@ -177,13 +179,13 @@ def figures(
         again.append(marked(one))
         right.append(is_right(again[-1]) or is_together(again[-1]))
         said = "unknown or an alias" if right[-1] else "MISNAMED or missed"
-        say(f"{said}: {line(again[-1])}; two laws come as near as {distances[one.seed]:.1f}")
+        say(f"{said}: {line(again[-1])}; wrong ones come as near as {distances[one.seed]:.1f}")
     yield judged(again, right, full)
     yield judged_shown(again, right, distances, full)
 
 
 def stands_out(one: Marked, distance: float) -> bool:
-    """Tell whether what two other laws leave of a single stands out of what its floor scatters by.
+    """Tell whether what the nearest wrong answer leaves of a single stands out of what its floor scatters by.
 
     Where it does not, no look at what is left can tell that a law is missing: 313 squares lie between a sensor's lag of
     476 us and a delay, where the floor scatters by 630.
@@ -192,7 +194,7 @@ def stands_out(one: Marked, distance: float) -> bool:
 
 
 def judged_shown(again: Sequence[Marked], right: Sequence[bool], distances: Mapping[int, float], full: bool) -> Figure:
-    """Give the share of right answers where a rest can be seen; distances: of two other laws, by seed."""
+    """Give the share of right answers where a rest can be seen; distances: of wrong answers, by seed."""
     seen = [
         (one, is_so)
         for one, is_so in zip(again, right, strict=True)
