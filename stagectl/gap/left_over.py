@@ -14,7 +14,7 @@ from stagectl.gap.normal_equations import Fold, Group, solve
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
 _LOUDEST_RATIO = 0.5
-"""Of the noise's own squares, what laws are inexact by at most: right ones that were looked at left 0.14 of them and less.
+"""Of the noise's own squares, what laws are inexact by at most: right ones left 0.14 of them and less.
 Dahl's law and a Stribeck friction in the place of bristles left 540 000 of 49 million, within 3 % of what there was,
 and 2.4 times the noise; of that, 4 mN had been taken for force noise."""
 
