@@ -13,8 +13,8 @@ from stagectl.gap.normal_equations import Fold, Group, solve
 
 _LEFT_SDS = 4.0
 _LEFT_SHARE = 0.03
-_LOUDEST_RATIO = 0.5
-"""Of the noise's own squares, what laws are inexact by at most: right ones left 0.14 of them and less.
+_LOUDEST_RATIO = 1.0
+"""Of the noise's own squares, what laws of the library are inexact by at most: right ones left 0.14 of them and less.
 Dahl's law and a Stribeck friction in the place of bristles left 540 000 of 49 million, within 3 % of what there was,
 and 2.4 times the noise; of that, 4 mN had been taken for force noise."""
 
@@ -92,8 +92,10 @@ def unknown_rest(
     left_share, curve_share = _LEFT_SHARE, _CURVE_SHARE
     if is_exact or is_exact_here:
         left_share, curve_share = _EXACT_LEFT_SHARE, _EXACT_CURVE_SHARE
-    loudest = _LOUDEST_RATIO * sum(s.count for s in search.evidence.sums)
-    floor = _LEFT_SDS * noise + min(left_share * max(first, 0.0), loudest)
+    floor = _LEFT_SDS * noise + left_share * max(first, 0.0)
+    if not _has_users(search, chosen):
+        loudest = _LOUDEST_RATIO * sum(s.count for s in search.evidence.sums)
+        floor = min(floor, _LEFT_SDS * noise + loudest)
     least = max(CURVE_GAIN * judge.threshold, curve_share * max(first, 0.0))
     if not left > floor and not gained > least:
         finer = finer_curve(search, chosen, finer_share * max(first, 0.0))
@@ -109,8 +111,13 @@ def are_exact(search: Competition, chosen: list[Group]) -> bool:
 
     Of a user's own effect nobody knows that its shape is found to the end: one left 0.9 % of what it had explained.
     """
+    return not search.judge.is_rough and not _has_users(search, chosen)
+
+
+def _has_users(search: Competition, chosen: list[Group]) -> bool:
+    """Tell whether a user's own effect is among the names."""
     names = [*(group.key[0] for group in chosen), *(effect.name for effect, *_ in search.moved)]
-    return not search.judge.is_rough and not any(name in CATALOGUE and CATALOGUE[name].origin for name in names)
+    return any(name in CATALOGUE and CATALOGUE[name].origin for name in names)
 
 
 def finer_curve(search: Competition, chosen: list[Group], material: float) -> Group | None:
