@@ -290,20 +290,8 @@ def test_masses_and_forces_that_are_all_larger_alike_change_nothing():
 
 def test_an_edge_is_looked_for_where_no_contact_is_believed_to_be():
     """The right edge lies 14 um further in, and is reached from there: no column knows of it, and no shift moved it."""
-    random, in_m = np.random.default_rng(8), 14e-6
-    apart_m = 25e-6 * np.sin(2.0 * np.pi * 2.0 * T_S)
-    middle_m = 25e-6 * np.sin(2.0 * np.pi * 2.0 * (T_S + 0.5 * H))
-    rate = 25e-6 * 4.0 * np.pi * np.cos(4.0 * np.pi * (T_S + 0.5 * H))
-    depth_m = np.maximum(middle_m - JOINT.right_m + in_m, 0.0)
-    press_n = np.maximum(JOINT.right_stiffness_n_per_m * depth_m + 90.0 * rate * (depth_m > 0.0), 0.0)
-    between_n = JOINT.spring_n_per_m * middle_m + JOINT.damping_n_s_per_m * rate + press_n  # on the end
-    both_n = -MASS_KG * W * W * _swing(T_S + 0.5 * H)
-    noise_m = NOISE_M * random.standard_normal((2, COUNT))
-    log = Log(
-        "run", H, _swing(T_S) + apart_m + noise_m[0], both_n + between_n - MASS_KG * 16.0 * np.pi**2 * middle_m,
-        np.ones(COUNT, bool), "1", end_position_m=_swing(T_S) + noise_m[1], micro_command_n=both_n - between_n,
-    )  # fmt: skip
-    refiner, evidence = _beside_known(balance.recording_of(log, STAGE))
+    in_m = 14e-6
+    refiner, evidence = _beside_known(balance.recording_of(_pressed(25e-6, -in_m, 8), STAGE))
     assert not np.any(evidence.recordings[0].side)
     shift = hypotheses.term_of(CATALOGUE["backlash_centre_shift"], "contact_edge", {})
     assert counts_at_size(evidence, shift)
@@ -311,6 +299,23 @@ def test_an_edge_is_looked_for_where_no_contact_is_believed_to_be():
     found = refiner.refined(shift)
     assert found is not None
     assert found[0].shape["shift_m"] == pytest.approx(-in_m, abs=0.2e-6)
+
+
+def _pressed(apart_m: float, out_m: float, seed: int) -> Log:
+    """Both bodies swing, apart by up to so much at 2 Hz; the right edge lies further out than is believed."""
+    random = np.random.default_rng(seed)
+    middle_m = apart_m * np.sin(4.0 * np.pi * (T_S + 0.5 * H))
+    rate = apart_m * 4.0 * np.pi * np.cos(4.0 * np.pi * (T_S + 0.5 * H))
+    depth_m = np.maximum(middle_m - JOINT.right_m - out_m, 0.0)
+    press_n = np.maximum(JOINT.right_stiffness_n_per_m * depth_m + 90.0 * rate * (depth_m > 0.0), 0.0)
+    between_n = JOINT.spring_n_per_m * middle_m + JOINT.damping_n_s_per_m * rate + press_n  # on the end
+    both_n = -MASS_KG * W * W * _swing(T_S + 0.5 * H)
+    noise_m = NOISE_M * random.standard_normal((2, COUNT))
+    macro_m = _swing(T_S) + apart_m * np.sin(4.0 * np.pi * T_S) + noise_m[0]
+    return Log(
+        "run", H, macro_m, both_n + between_n - MASS_KG * 16.0 * np.pi**2 * middle_m,
+        np.ones(COUNT, bool), "1", end_position_m=_swing(T_S) + noise_m[1], micro_command_n=both_n - between_n,
+    )  # fmt: skip
 
 
 def _beside_known(recording: Recording) -> tuple[Refiner, Evidence]:
@@ -326,20 +331,8 @@ def _beside_known(recording: Recording) -> tuple[Refiner, Evidence]:
 
 def test_an_edge_that_is_far_off_is_found_however_shallow_the_contact():
     """Both edges lie 24 um further out, where contacts are 11 um deep: a fit at 10 or at 30 um has another contact."""
-    random, out_m = np.random.default_rng(6), 24e-6
-    apart_m = 65e-6 * np.sin(2.0 * np.pi * 2.0 * T_S)
-    middle_m = 65e-6 * np.sin(2.0 * np.pi * 2.0 * (T_S + 0.5 * H))
-    rate = 65e-6 * 4.0 * np.pi * np.cos(4.0 * np.pi * (T_S + 0.5 * H))
-    depth_m = np.maximum(middle_m - JOINT.right_m - out_m, 0.0)
-    press_n = np.maximum(JOINT.right_stiffness_n_per_m * depth_m + 90.0 * rate * (depth_m > 0.0), 0.0)
-    between_n = JOINT.spring_n_per_m * middle_m + JOINT.damping_n_s_per_m * rate + press_n  # on the end
-    both_n = -MASS_KG * W * W * _swing(T_S + 0.5 * H)
-    noise_m = NOISE_M * random.standard_normal((2, COUNT))
-    log = Log(
-        "run", H, _swing(T_S) + apart_m + noise_m[0], both_n + between_n - MASS_KG * 16.0 * np.pi**2 * middle_m,
-        np.ones(COUNT, bool), "1", end_position_m=_swing(T_S) + noise_m[1], micro_command_n=both_n - between_n,
-    )  # fmt: skip
-    refiner, _ = _beside_known(balance.recording_of(log, STAGE))
+    out_m = 24e-6
+    refiner, _ = _beside_known(balance.recording_of(_pressed(65e-6, out_m, 6), STAGE))
     wider = hypotheses.term_of(CATALOGUE["backlash_width_change"], "contact_edge", {})
     assert refiner.gain_at_size(wider) > 1000.0
     found, _ = refiner.refined(wider)
