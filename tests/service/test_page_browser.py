@@ -340,8 +340,9 @@ def test_a_motion_that_no_status_shows_under_way_says_what_became_of_it(idle, op
     page.fill("#target", "3")
     page.click("#move")
     expect(page.locator("#command-text")).to_have_text("move: done", timeout=PATIENCE_MS)
+    state_is(page, "armed")  # the move's answer may come before the status that permits a jog
     press(page, "#jog-left")
-    idle.state_is("moving")
+    state_is(page, "moving")  # asked of the page: its stream goes through this process, and stands while it sleeps
     page.mouse.up()
     expect(page.locator("#command-text")).to_have_text("jogging: done", timeout=PATIENCE_MS)
     page.click("#stop")
