@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from stagectl.effects import CATALOGUE
 from stagectl.effects.table import KNOTS_COUNT
-from stagectl.gap.command_path import PARTS_COUNT
+from stagectl.gap.interval_parts import PARTS_COUNT
 from stagectl.gap.effect_forces import SPREADS, between, edges_moved, spread_out
 from stagectl.gap.forces import Forces
 from stagectl.gap.hypotheses import Term

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from stagectl.compiled import compiled
-from stagectl.gap.command_path import PARTS_COUNT
-from stagectl.gap.innovations import certainty, filtered, moments
+from stagectl.gap.innovations import certainty, filtered
+from stagectl.gap.interval_parts import PARTS_COUNT, moments
 
 _WINDOW = 21
 _ORDER = 3
@@ -143,7 +143,7 @@ def motion_under(
     step_s = period_s / force_n.shape[1]
     acceleration = (force_n + known[:, 2:]) / mass_kg
     velocity = known[:, 1:2] + step_s * (np.cumsum(acceleration, axis=1) - 0.5 * acceleration)
-    position = known[:, :1] + step_s * (np.cumsum(velocity, axis=1) - 0.5 * velocity)
+    position = known[:, :1] + step_s * (np.cumsum(velocity, axis=1) - 0.5 * velocity) - step_s**2 / 12.0 * acceleration
     before = np.concatenate([acceleration[:1, 0], acceleration[:-1, -1]])
     at_samples = np.column_stack([foretold, before])
     unsure = np.min(np.abs(velocity), axis=1) < _UNSURE_SDS * spread_m_per_s

@@ -6,7 +6,7 @@ import numpy as np
 
 from stagectl import compose
 from stagectl.effects import Effect
-from stagectl.gap.command_path import PARTS_COUNT
+from stagectl.gap.interval_parts import PARTS_COUNT
 from stagectl.gap.contact import side_stiffness_n_per_m
 from stagectl.gap.motion import way_per_s
 from stagectl.gap.recording import Recording, relative_motion
