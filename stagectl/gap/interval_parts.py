@@ -1,11 +1,11 @@
-"""Forces on equal parts of sample intervals, and what they move: their mean, and their mean weighted towards the start.
+"""Forces on equal parts of sample intervals, and what they move: their mean, and one weighted towards the start.
 
-    x(h) = x(0) + v(0) h + h^2 early / 2 m,    v(h) = v(0) + h mean / m,    early = (2 / h^2) integral of (h - s) f(s) ds
+    v(h) = v(0) + h mean / m,    x(h) = x(0) + h v(0) + h^2 early / 2 m,    early = 2 / h^2 integral of (h - s) f(s) ds
 
-Forces are kept as their means over parts. Within a part they go on a line, as far as the parts of the same interval tell
-(no later one: what acts there knows of a later sample). Held over parts they came late: the mass that a multisine of 13
-Hz moved seemed 37 ppm too large, nine deviations of a reading of 7 nm, and a lag of 151 us was a delay beside another
-mass. Pure.
+Forces are kept as their means over parts. Within a part they go on a line, as far as the parts of the same interval
+tell (no later one: what acts there knows of a later sample). Held over parts they came late: the mass that a multisine
+of 13 Hz moved seemed 37 ppm too large, nine deviations of a reading of 7 nm, and a lag of 151 us was a delay beside
+another mass. Pure.
 """
 
 import numpy as np
@@ -47,7 +47,7 @@ def moments(fine_n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @compiled
 def with_early(fine_n: np.ndarray, early_n: np.ndarray) -> np.ndarray:
-    """Return means over parts tilted within each interval, so that `moments` has `early_n` of it: steps are no lines."""
+    """Return means over parts tilted within each interval until `moments` has `early_n` of it: steps are no lines."""
     tilted_n = np.empty_like(fine_n)
     for k in range(fine_n.shape[0]):
         tilt_n = (early_n[k] - moments_of(fine_n, k)[1]) / _TILT_EARLY
