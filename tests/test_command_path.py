@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from stagectl.effects import CATALOGUE
 from stagectl.gap import balance
 from stagectl.gap.believed import Believed, BelievedAxis
-from stagectl.gap.command_path import PARTS_COUNT, behind, changed_by, driven, driven_later
+from stagectl.gap.command_path import behind, changed_by, driven, driven_later
 from stagectl.gap.effect_forces import known_forces
 from stagectl.gap.hypotheses import deviation_term, parameter_terms
 from stagectl.gap.innovations import Noise
+from stagectl.gap.interval_parts import PARTS_COUNT
 from stagectl.gap.log import Log
 from stagectl.gap.operating_point import operating_point
 
@@ -66,20 +66,6 @@ def test_what_comes_later_by_as_much_is_a_later_latch(latch_s, lag_s, late_s):
     found = driven_later(COMMAND, latch_s, lag_s, PERIOD_S, np.full(edges, late_s))
     wanted, _ = driven(COMMAND, latch_s + late_s, lag_s, PERIOD_S)
     assert np.abs(found - wanted)[30:-30].max() < 1e-9 * STEP
-
-
-@pytest.mark.parametrize("lag_s", [0.0, 0.1e-3])
-def test_what_comes_ever_later_is_read_off_the_same_current_at_those_instants(lag_s):
-    """Against the current on a grid of a thousandth of an interval, 0.2 % later with every second that goes by."""
-    latch_s, rate, fine = 0.57e-3, 2e-3, 1000
-    command, t_s = COMMAND[:60], (np.arange(60 * fine) + 0.5) * PERIOD_S / fine
-    goal = command[np.clip(np.floor((t_s - latch_s) / PERIOD_S).astype(int), 0, None)]
-    keeps = np.exp(-PERIOD_S / fine / lag_s) if lag_s else 0.0
-    current = lfilter([1.0 - keeps], [1.0, -keeps], goal, zi=[keeps * goal[0]])[0]
-    wanted = np.interp(t_s - rate * t_s, t_s, current).reshape(60, PARTS_COUNT, -1).mean(axis=2)
-    edges_s = np.arange(60 * PARTS_COUNT + 1) * PERIOD_S / PARTS_COUNT
-    found = driven_later(command, latch_s, lag_s, PERIOD_S, rate * edges_s)
-    assert np.abs(found - wanted)[:-1].max() < 5e-3 * STEP
 
 
 def test_a_dead_band_changes_the_commands_themselves():

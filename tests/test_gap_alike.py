@@ -117,6 +117,8 @@ def test_frictions_leave_what_smooth_laws_do(made_n):
     gained = judge.gain([found]) - judge.gain([])
     assert judge._inexact([found], _of_library(search, "cubic_stiffness")) < 0.1 * EXACT_RATIO * gained
     assert judge._inexact([found], _of_library(search, "position_dependent_friction")) > 0.9 * EXACT_RATIO * gained
+    both = [found, _of_library(search, "coulomb_friction")]  # each explains most of what the other does
+    assert judge._inexact(both, _of_library(search, "cubic_stiffness")) < 0.1 * EXACT_RATIO * gained
 
 
 def _shaken() -> Made:

@@ -145,6 +145,13 @@ def test_a_contact_is_not_turned_by_the_noise_of_its_readings():
     assert float(np.std(pushed_n - true_n)) < 0.01 * float(np.std(true_n))
 
 
+def test_bristles_are_not_let_go_of_by_the_noise_of_a_stage_that_stands():
+    """They let go over a way: that of a smoothed velocity is 2 um in each of these seconds."""
+    read_m = 10e-9 * np.random.default_rng(1).standard_normal(COUNT)
+    way_m = np.abs(motion_of(read_m, H, 10e-9).quiet_m_per_s[:, 0]).sum() * H
+    assert way_m < 1e-6 * COUNT * H
+
+
 def test_what_the_joint_was_settled_by_is_known(touching):
     there = with_joint_changed(touching, 0.2e-6, -0.1e-6, 0.05)
     found = settled_by(STAGE, there)

@@ -14,14 +14,13 @@ from stagectl.errors import RecordError, RequestError
 from stagectl.gap import balance, hypotheses, innovations, left_over
 from stagectl.gap.aliases import aliases_of
 from stagectl.gap.believed import Believed, BelievedAxis
-from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.competition import Competition
 from stagectl.gap.evidence import Added
 from stagectl.gap.findings import PARAMETER
 from stagectl.gap.findings_file import read_findings, write_findings
 from stagectl.gap.forces import Forces
 from stagectl.gap.hypotheses import widest_amplitudes
-from stagectl.gap.innovations import moments
+from stagectl.gap.interval_parts import PARTS_COUNT
 from stagectl.gap.judge import FLOOR_VARIANCE, Judge
 from stagectl.gap.left_over import excess, finer_curve, one_curve_for_many, unknown_rest
 from stagectl.gap.log import Log, log_of_rows
@@ -108,13 +107,6 @@ def test_what_is_missing_adds_its_own_column():
     seen = _moved(force + hidden, np.zeros(n))
     difference = _white(seen, force, 5e-9) - _white(seen, force + hidden, 5e-9)
     assert np.allclose(difference, _white(np.zeros(n), -hidden, 5e-9), atol=1e-9 * np.abs(difference).max())
-
-
-def test_forces_early_in_an_interval_move_further():
-    """A push in the first quarter only: mean 1/4; weighted 2 (1 - 1/8) / 4 = 7/16."""
-    mean, early = moments(np.array([[1.0, 0.0, 0.0, 0.0]]))
-    assert mean[0] == 0.25
-    assert early[0] == pytest.approx(7.0 / 16.0)
 
 
 def _sums(random, planted: float, run: str, count: int = 4000) -> Sums:

@@ -3,7 +3,7 @@
 A command is held for a period and taken over some time after its sample, within a part of an interval. An effect run on
 means over parts smears that step: a delay of 102 us came out as one of 38 us and a lag (measured on data that hold a
 delay alone). So a linear effect is its step response, put at every step of the commands where it happens; one without
-memory changes the commands themselves. Pure.
+memory changes the commands themselves. Means over parts are tilted to what a step within a part moves. Pure.
 """
 
 import functools
@@ -15,9 +15,7 @@ from scipy.signal import lfilter
 from stagectl import compose
 from stagectl.compiled import compiled
 from stagectl.effects import CATALOGUE, Effect
-
-PARTS_COUNT = 4
-"""Parts of a sample interval: friction on whole milliseconds left 57 times its noise, on quarters 8 (prototype)."""
+from stagectl.gap.interval_parts import PARTS_COUNT, with_early
 
 _STEP_RATIO = 1.0 / 1024.0  # of a period: the grid of step responses
 _RESPONSE_PERIODS = (16, 256)  # of a step response: the second where it has not faded within the first
@@ -73,15 +71,17 @@ def driven(command: np.ndarray, latch_s: float, lag_s: float, period_s: float) -
     """
     now, before, rest = _held(command, latch_s / period_s)
     if not lag_s > 0.0:
-        held = delayed(command, latch_s / period_s)
-        return held, np.where(rest > 0.0, before, now)
+        early = before + (now - before) * (1.0 - rest) ** 2
+        return with_early(delayed(command, latch_s / period_s), early), np.where(rest > 0.0, before, now)
     starts, at_latch = _relaxing(now, before, rest, lag_s / period_s)
     edges = np.arange(PARTS_COUNT + 1) / PARTS_COUNT
     lag = lag_s / period_s
     turns = np.clip(rest, edges[:-1], edges[1:])
     earlier = np.array([_area(low, turn, 0.0, lag) for low, turn in zip(edges[:-1], turns, strict=True)])
     later = np.array([_area(turn, high, rest, lag) for turn, high in zip(turns, edges[1:], strict=True)])
-    return _relaxed(starts, before, at_latch, now, PARTS_COUNT * earlier, PARTS_COUNT * later), starts
+    means = _relaxed(starts, before, at_latch, now, PARTS_COUNT * earlier, PARTS_COUNT * later)
+    weights = np.array([_early_area(0.0, rest, 0.0, lag)]), np.array([_early_area(rest, 1.0, rest, lag)])
+    return with_early(means, _relaxed(starts, before, at_latch, now, *weights)[:, 0]), starts
 
 
 def _relaxing(now: np.ndarray, before: np.ndarray, rest: float, lag: float) -> tuple[np.ndarray, np.ndarray]:
@@ -103,7 +103,8 @@ def driven_later(command: np.ndarray, latch_s: float, lag_s: float, period_s: fl
     lag = max(lag_s / period_s, 0.0)
     starts, at_latch = _relaxing(now, before, rest, lag) if lag > 0.0 else (before, now)
     there = np.arange(now.size * PARTS_COUNT + 1) / PARTS_COUNT - late_s / period_s
-    return _between(there, starts, before, at_latch, now, rest, lag).reshape(-1, PARTS_COUNT)
+    held = starts, before, at_latch, now, rest, lag
+    return with_early(_between(there, *held).reshape(-1, PARTS_COUNT), _early_between(there[::PARTS_COUNT], *held))
 
 
 @compiled
@@ -144,6 +145,46 @@ def _impulse(until: float, start: float, before: float, at_latch: float, now: fl
     return total
 
 
+@compiled
+def _early_between(
+    edges: np.ndarray,
+    starts: np.ndarray,
+    before: np.ndarray,
+    at_latch: np.ndarray,
+    now: np.ndarray,
+    rest: float,
+    lag: float,
+) -> np.ndarray:
+    """Return means that are weighted towards the start between edges (in periods) of the same."""
+    n = now.size
+    early = np.empty(edges.size - 1)
+    for j in range(early.size):
+        begin, end = edges[j], edges[j + 1]
+        total = starts[0] * (end - 0.5 * (begin + min(end, 0.0))) * (min(end, 0.0) - begin) if begin < 0.0 else 0.0
+        total += 0.5 * now[n - 1] * (end - max(begin, float(n))) ** 2 if end > n else 0.0
+        inside, until = min(max(begin, 0.0), float(n)), min(max(end, 0.0), float(n))
+        for k in range(int(inside), min(int(until), n - 1) + 1):
+            low, high = max(inside - k, 0.0), min(until - k, 1.0)
+            goes = starts[k], before[k], at_latch[k], now[k], rest, lag
+            at_low = _impulse(low, *goes)
+            total += (end - k - high) * (_impulse(high, *goes) - at_low)
+            total += _twice(high, *goes) - _twice(low, *goes) - (high - low) * at_low
+        early[j] = 2.0 * total / (end - begin) ** 2
+    return early
+
+
+@compiled
+def _twice(until: float, start: float, before: float, at_latch: float, now: float, rest: float, lag: float) -> float:
+    """Integrate one interval of it twice, from its sample on."""
+    early, late = min(until, rest), max(until - rest, 0.0)
+    total = before * early * (until - 0.5 * early) + 0.5 * now * late**2
+    if lag > 0.0:
+        faded = np.expm1(-early / lag)
+        total += (start - before) * lag * (early - (until - early - lag) * faded)
+        total += (at_latch - now) * lag * (late + lag * np.expm1(-late / lag))
+    return total
+
+
 def at_delays(made: Callable[[float], np.ndarray], latch_s: float, late_s: np.ndarray, period_s: float) -> np.ndarray:
     """Return `made` of a latch that is later by what each interval has, on that interval.
 
@@ -167,6 +208,13 @@ def _area(low: float, high: float, origin: float, lag: float) -> tuple[float, fl
     if not high > low:
         return 0.0, 0.0
     return high - low, lag * (np.exp(-(low - origin) / lag) - np.exp(-(high - origin) / lag))
+
+
+def _early_area(low: float, high: float, origin: float, lag: float) -> tuple[float, float]:
+    """Integrate 2 (1 - s) times the same."""
+    from_low, from_high = np.exp(-(low - origin) / lag), np.exp(-(high - origin) / lag)
+    way = lag * ((1.0 - low - lag) * from_low - (1.0 - high - lag) * from_high)
+    return (1.0 - low) ** 2 - (1.0 - high) ** 2, 2.0 * way
 
 
 @compiled
@@ -305,7 +353,11 @@ def _stepped(
     edges_s = np.arange(periods * PARTS_COUNT + 1) * period_s / PARTS_COUNT - latch_s
     areas = np.interp(edges_s, grid_s, area_s, left=0.0, right=float(area_s[-1]))
     kernel = np.diff(areas).reshape(periods, PARTS_COUNT) * (PARTS_COUNT / period_s)
-    at_samples = np.interp(np.arange(periods) * period_s - latch_s, grid_s[1:], after, left=0.0, right=0.0)
+    grid_s, area_s = np.append(grid_s, edges_s[-1] + dt_s), np.append(area_s, area_s[-1])
+    twice_s2 = np.concatenate([[0.0], np.cumsum(0.5 * (area_s[1:] + area_s[:-1]) * np.diff(grid_s))])
+    twice_s2 = np.interp(edges_s[::PARTS_COUNT], grid_s, twice_s2, left=0.0)
+    kernel = with_early(kernel, 2.0 * (np.diff(twice_s2) / period_s - areas[:-1:PARTS_COUNT]) / period_s)
+    at_samples = np.interp(np.arange(periods) * period_s - latch_s, grid_s[1:-1], after, left=0.0, right=0.0)
     steps = np.diff(command[np.minimum(np.arange(command.size) + early, command.size - 1)], prepend=command[0])
     means = np.stack([np.convolve(steps, kernel[:, part])[: command.size] for part in range(PARTS_COUNT)], axis=1)
     return means, np.convolve(steps, at_samples)[: command.size]

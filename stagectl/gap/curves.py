@@ -12,10 +12,10 @@ from scipy.interpolate import CubicSpline
 
 from stagectl.effects import CATALOGUE
 from stagectl.effects.table import KNOTS_COUNT
-from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.effect_forces import SPREADS, between, edges_moved, spread_out
 from stagectl.gap.forces import Forces
 from stagectl.gap.hypotheses import Term
+from stagectl.gap.interval_parts import PARTS_COUNT
 from stagectl.gap.late_readings import Row
 from stagectl.gap.quantities import quantities
 from stagectl.gap.reading_errors import misread

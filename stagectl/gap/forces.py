@@ -39,8 +39,12 @@ def scaled_forces(forces: Forces, factor: float, more: Forces) -> Forces:
 
 
 def squares_of(forces: Forces) -> float:
-    """Return the sum of the squares of all that forces hold, in their units: to compare one law with itself."""
-    return sum(float(np.sum(value * value)) for value in _values_of(forces) if value is not None)
+    """Return the sum of the squares of all that forces hold, in their units: to compare one law with itself.
+
+    Of means over intervals: when within one a step comes is in its parts, and of a delay no proportion.
+    """
+    means = (value.reshape(value.shape[0], -1).mean(axis=1) for value in _values_of(forces) if value is not None)
+    return sum(float(mean @ mean) for mean in means)
 
 
 def _values_of(forces: Forces) -> tuple[np.ndarray | None, ...]:

@@ -10,16 +10,16 @@ input, whatever controller ran, the innovations hold all that the positions say 
 method, Ljung 1999, 7). The filter is linear: the innovations of f0 + a f1 are those of f0 plus a times those of f1
 alone, which makes every effect a column of a regression.
 
-Forces come as two numbers a sample interval: their mean, and their mean weighted towards the interval's beginning,
-(2 / h^2) integral of (h - s) f(s) ds, which is what moves the position. Pure; knows no clock.
+Forces come as two numbers a sample interval, their mean and what moves the position (`interval_parts`). Pure; knows no
+clock.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from stagectl.compiled import compiled, inlined
-from stagectl.gap.command_path import PARTS_COUNT
+from stagectl.compiled import compiled
+from stagectl.gap.interval_parts import PARTS_COUNT, moments_of
 
 _START_SD = (1e-6, 1e-2)  # of position and velocity before the first sample, m and m/s
 _STATES = 4
@@ -145,7 +145,7 @@ def innovations(position_m, force_n, sign, steps, judged, mass_kg, period_s, cor
         out[judged_count] = z / steps[k, 4]
         judged_count += judged[k]
         if has_force:
-            mean_n, early_n = _moments(force_n, k)
+            mean_n, early_n = moments_of(force_n, k)
             mean_n, early_n = sign * mean_n, sign * early_n
         x = (x + v * h + moved * (early_n + d)) + steps[k, 0] * z
         v = (v + turned * (mean_n + d)) + steps[k, 1] * z
@@ -208,21 +208,3 @@ def filtered(position_m, valid, mean_n, early_n, gain, variance, mass_kg, period
         v += a[1, 2] * d + h * mean_n[k] / mass_kg
         d, e = a[2, 2] * d + a[2, 3] * e, a[3, 2] * d + a[3, 3] * e
     return known, foretold, unlikely
-
-
-@inlined
-def _moments(fine_n, k):
-    mean, early = 0.0, 0.0
-    for part in range(PARTS_COUNT):
-        mean += fine_n[k, part]
-        early += (2.0 - (2.0 * part + 1.0) / PARTS_COUNT) * fine_n[k, part]
-    return mean / PARTS_COUNT, early / PARTS_COUNT
-
-
-@compiled
-def moments(fine_n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (mean, early-weighted mean) of forces on parts of each interval, shape (n, PARTS_COUNT)."""
-    mean_n, early_n = np.empty(fine_n.shape[0]), np.empty(fine_n.shape[0])
-    for k in range(fine_n.shape[0]):
-        mean_n[k], early_n[k] = _moments(fine_n, k)
-    return mean_n, early_n

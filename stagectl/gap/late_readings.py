@@ -20,7 +20,6 @@ from stagectl.compiled import compiled
 from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap.believed import BelievedAxis
 from stagectl.gap.command_path import (
-    PARTS_COUNT,
     Acting,
     at_delays,
     at_once,
@@ -30,6 +29,7 @@ from stagectl.gap.command_path import (
     driven_later,
     lagged,
 )
+from stagectl.gap.interval_parts import PARTS_COUNT
 from stagectl.gap.log import Log
 from stagectl.gap.motion import Motion
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from stagectl import compose
 from stagectl.effects import Effect
-from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.contact import side_stiffness_n_per_m
+from stagectl.gap.interval_parts import PARTS_COUNT
 from stagectl.gap.motion import way_per_s
 from stagectl.gap.recording import Recording, relative_motion
 
@@ -96,12 +96,16 @@ def _made(recording: Recording, axis: str, kind: str) -> dict[str, Callable[[], 
     return made
 
 
+_STOPS_RATIO = 0.5
+"""Of the joint's noise, half the play that it is carried with: smoothed, it scatters by nine tenths of that."""
+
+
 def _closing_way_per_s(recording: Recording, side: np.ndarray) -> np.ndarray:
     """Return how fast the joint closes beyond what its readings scatter by, late as they are, on parts of intervals."""
     noise_m = float(np.hypot(recording.belief("macro").noise_m, recording.belief("end").noise_m))
     late_m = relative_motion(recording)[0] - (recording.macro.position_m - recording.motion("end").position_m)
     read_m = recording.position_m("macro") - recording.position_m("end") + late_m[:, 0]
-    return side * way_per_s(read_m, noise_m, recording.log.period_s)[:, None]
+    return side * way_per_s(read_m, _STOPS_RATIO * noise_m, recording.log.period_s)[:, None]
 
 
 def _of_sensor(recording: Recording, axis: str) -> dict[str, np.ndarray]:

@@ -4,9 +4,9 @@ import numpy as np
 
 from stagectl.compiled import compiled
 from stagectl.effects import Effect, Trait
-from stagectl.gap.command_path import PARTS_COUNT
 from stagectl.gap.contact import more_push_n
 from stagectl.gap.forces import Forces
+from stagectl.gap.interval_parts import PARTS_COUNT
 from stagectl.gap.quantities import AT_READING, AT_READING_SD, along_motion, quantities
 from stagectl.gap.recording import Recording, contact_push_n, relative_motion
 

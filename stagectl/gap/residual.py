@@ -22,8 +22,8 @@ from stagectl.gap.believed import Believed
 from stagectl.gap.effect_forces import effect_forces, known_forces
 from stagectl.gap.findings import Findings, Named
 from stagectl.gap.forces import Forces, add_forces
+from stagectl.gap.interval_parts import PARTS_COUNT, moments
 from stagectl.gap.log import Log
-from stagectl.gap.motion import PARTS_COUNT
 from stagectl.gap.recording import Recording
 
 NOISE_FORCE_N = 0.05
@@ -310,11 +310,10 @@ def missing_force_n(recording: Recording, axis: str, forces: Forces) -> np.ndarr
     if error_m is not None:
         position_m = position_m - error_m
     position_m = _bridged(position_m, recording.log.valid)
-    middles = (np.arange(PARTS_COUNT) + 0.5) / PARTS_COUNT
     if force_n is None:
         force_n = np.zeros((position_m.size, PARTS_COUNT))
-    following = force_n @ (1.0 - middles) / PARTS_COUNT
-    preceding = force_n @ middles / PARTS_COUNT
+    mean_n, early_n = moments(force_n)
+    following, preceding = 0.5 * early_n, mean_n - 0.5 * early_n
     inner = recording.mass_kg(axis) * np.diff(position_m, 2) / h**2 - following[1:-1] - preceding[:-2]
     return np.concatenate([inner[:1], inner, inner[-1:]])
 

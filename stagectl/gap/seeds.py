@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stagectl.gap import innovations
-from stagectl.gap.command_path import PARTS_COUNT
+from stagectl.gap.interval_parts import PARTS_COUNT
 from stagectl.gap.recording import Recording
 
 PEAKS_COUNT = 4
