@@ -23,7 +23,7 @@ from tests.blind import detection, generate, together
 
 BAR = Bar("effect taken out of the library: unknown, or its stated alias", "%", 100.0, at_least=True)
 
-SHOWN = Bar("the same, where what any two other laws leave stands out of the floor", "%")
+SHOWN = Bar("the same, where what a wrong answer of one or two laws leaves stands out of the floor", "%")
 _SHOWN_SDS = 5.3  # a rest is one from 4 standard errors of the floor on: 1.3 more are a power of 0.9
 
 _FULL_SETS_COUNT = 3
@@ -202,16 +202,18 @@ def judged_shown(again: Sequence[Marked], right: Sequence[bool], distances: Mapp
     ]
     hidden = len(again) - len(seen)
     if not seen:
-        return absent(SHOWN, f"of {len(again)} effects nothing that two other laws leave stands out of the floor")
+        return absent(SHOWN, f"of {len(again)} effects nothing that a wrong answer leaves stands out of the floor")
     seeds = sorted(one.searched.seed for one, _ in seen)
     found = suite_figures.share(sum(is_so for _, is_so in seen), len(seen))
-    remark = f"{hidden} others can't show that a law is missing: two other ones leave less"
+    remark = f"{hidden} others can't show that a law is missing: a wrong answer leaves less"
     return suite_figures.judged_estimate(SHOWN, found, seeds, full, remark)
 
 
 def judged(again: Sequence[Marked], right: Sequence[bool], full: bool) -> Figure:
     """Hold the share of effects that came back as unknown or as an alias against its bar."""
-    remark = f"{len(again)} effects, each on the set of those that hide it alone that no two other laws come near"
+    remark = (
+        f"{len(again)} effects, each on the set of those that hide it alone that no one or two other laws come near"
+    )
     if not again:
         return absent(BAR, remark)
     wrong = [(one.searched.truth or {}).get("effects") for one, is_so in zip(again, right, strict=True) if not is_so]

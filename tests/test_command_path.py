@@ -1,5 +1,7 @@
 """What drives and effects of the command path make of held commands, against closed forms."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -133,3 +135,12 @@ def test_beside_a_delay_that_is_known_the_latch_is_the_same_column(under_a_delay
     for one, other in ((latch.macro_n, delay.macro_n), (latch.macro_current_a, delay.macro_current_a)):
         inner, wanted = one[30:-30], other[30:-30] / DELAY_S
         assert np.linalg.norm(inner - wanted) < 0.05 * np.linalg.norm(wanted)
+
+
+def test_a_latch_that_is_hardly_known_is_asked_for_as_far_as_it_may_well_be():
+    axis = dataclasses.replace(AXIS.macro, latch_s=0.0, latch_sd_s=0.5e-3, current_loop_s=0.0)
+    log = Log("run", PERIOD_S, np.zeros(COMMAND.size), COMMAND, np.ones(COMMAND.size, bool), "1")
+    recording = balance.recording_of(log, dataclasses.replace(AXIS, macro=axis))
+    latch = next(term for term, _ in parameter_terms(recording) if term.name == "macro_latch_s").forces(recording)[0]
+    later, now = (driven(COMMAND, latch_s, 0.0, PERIOD_S)[0] for latch_s in (0.25e-3, 0.0))
+    assert latch.macro_n * 0.25e-3 == pytest.approx(later - now, abs=1e-9)
