@@ -15,6 +15,7 @@ from stagectl.gap.findings import Named
 from stagectl.gap.judge import ALIAS_SHARE, EXACT_RATIO, LEFT_SDS, Judge
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group
+from stagectl.gap.parts import levelled
 from stagectl.gap.selection import select
 from stagectl.gap.settling import Left
 from tests.driven_axis import AXIS, STEPS, H, axis_under
@@ -84,6 +85,23 @@ def test_an_offset_and_a_spring_are_one_cable():
     search = _search(_pulled_by(60.0, 0.25))
     start = [_of_library(search, "offset"), _of_library(search, "linear_stiffness")]
     assert [group.key[0] for group in select(search.judge, start)] == ["cable_spring"]
+
+
+def test_two_levels_that_a_rise_stands_on_are_one_level_and_a_push():
+    """Along the motion they are the same, of as many numbers; a level alone is none that was asymmetric."""
+
+    def risen(command_n: float, x: float, v: float) -> float:
+        return command_n - 3.0 * float(np.sign(v)) * (1.0 + 0.8 * float(np.exp(-((v / 0.02) ** 2)))) - 1.2
+
+    search = _search(lambda: risen)
+    levels, rise = (_of_library(search, name) for name in ("asymmetric_coulomb_friction", "stribeck_friction"))
+    (rise,) = search.judge.refine([*search.judge.base, levels], [rise])
+    assert [group.key[0] for group in levelled(search.judge, [rise, levels])] == [
+        "stribeck_friction",
+        "coulomb_friction",
+        "offset",
+    ]
+    assert levelled(search.judge, [levels]) == [levels]
 
 
 def test_a_spring_about_zero_is_no_cable():
