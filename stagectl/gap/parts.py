@@ -95,11 +95,17 @@ def levelled(judge: Judge, chosen: Sequence[Group]) -> list[Group]:
             continue
         rest = [other for other in found if other is not group]
         taken = {other.key for other in rest}
-        of_place = {other.key[0]: other for other in judge.library if other.key[1] == place and other.key not in taken}
-        pushes = [of_place[name] for name in ("offset", "gravity_tilt") if name in of_place]
-        if "coulomb_friction" not in of_place or not pushes:
+        levels, pushes = (
+            [
+                other
+                for other in judge.library
+                if other.key[1] == place and other.key[0] in names and other.key not in taken
+            ]
+            for names in (("coulomb_friction",), ("offset", "gravity_tilt"))
+        )
+        parts = [[level, push] for level, push in itertools.product(levels, pushes)]
+        if not parts:
             continue
-        parts = [[of_place["coulomb_friction"], push] for push in pushes]
         best = max(parts, key=lambda two: round(judge.worth([*rest, *two]), 3))  # the first of those that are the same
         as_good = judge.worth([*rest, *best]) > judge.worth(found) - _excused_of_parts(judge, found, group)
         if as_good and judge.allows([*rest, *best]):
