@@ -326,17 +326,14 @@ class Judge:
         curve that nothing explained. Of two frictions each explains most of what the other does: one by one they were
         worth little of their 754 000 squares, and a spring of 205 was left out (1009049).
         """
-        rough = [other for other in chosen if not is_smooth(other)]
-        rougher = [
-            other
-            for other in rough
-            if not act_apart(other, group)
-            and (not is_friction(other) or (is_friction(group) and other.key[1] == group.key[1]))
+        here = [other for other in chosen if not act_apart(other, group)]
+        rough = [other for other in here if not is_smooth(other)]
+        others_akin = [
+            other for other in rough if not is_friction(other) or (is_friction(group) and other.key[1] == group.key[1])
         ]
-        smooth = self.gain(chosen) - self.gain(rough)
-        friction = self.gain(rough) - self.gain(rougher)
-        total = self.gain([*chosen, group]) - self.gain([]) + self.modelled
-        return EXACT_RATIO * max(total - smooth - friction, 0.0) + FRICTION_RATIO * friction + SMOOTH_RATIO * smooth
+        smooth, friction = self.gain(here) - self.gain(rough), self.gain(rough) - self.gain(others_akin)
+        rest = max(self.gain([*others_akin, group]) - self.gain([]) + self.modelled, 0.0)
+        return EXACT_RATIO * rest + FRICTION_RATIO * friction + SMOOTH_RATIO * smooth
 
     def _is_exact_with(self, chosen: Sequence[Group], group: Group) -> bool:
         """Tell whether no curve finds anything any more with a hypothesis, which is a good part of what was left.
