@@ -290,8 +290,8 @@ class Judge:
     def stays(self, chosen: Sequence[Group], group: Group) -> bool:
         """Tell whether a hypothesis gains beyond noise, more than it costs, enough, and nothing speaks against it.
 
-        Enough of what laws gained that may be inexact here: iron of the macro's motor of 570 million squares, which left
-        28 000 and curves over the macro, hid a friction of the micro of 139 (1010103).
+        Enough of what laws gained that may be inexact here: iron of the macro's motor of 570 million squares, which
+        left 28 000 and curves over the macro, hid a friction of the micro of 139 (1010103).
         """
         whole = self.gain([*chosen, group])
         known = CATALOGUE.get(group.key[0])
