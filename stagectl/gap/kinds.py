@@ -50,6 +50,12 @@ def is_friction(group: Group) -> bool:
     return known is not None and not known.origin and (known.has_step or shows_at_low_speed(group))
 
 
+def swings(group: Group) -> bool:
+    """Tell whether a law is a share of the mass on a spring."""
+    known = CATALOGUE.get(group.key[0])
+    return known is not None and Trait.SWINGS in known.traits
+
+
 def act_apart(one: Group, other: Group) -> bool:
     """Tell whether two laws push different bodies, of which no motor pushes the other one back.
 
