@@ -92,8 +92,8 @@ def way_per_s(read_m: np.ndarray, stops_m: float, period_s: float) -> np.ndarray
     2 um in a second, in place of 0.9, by which bristles let go of a stage that stands: of 20 sets with such frictions
     (1003002 to 3428) eleven left less, from 128 000 squares to 60 000 and from 335 to 111, and none 15 more.
 
-    Where a contact was pressed by 40 um, or pressed and let go by 50 um, readings of 20 nm made errors of 24 and 27 % in
-    what turns over 6 um by the filter's velocity, of 4 and 10 % by smoothed ones, and of 0.2 and 0.6 % by this. With
+    Where a contact was pressed by 40 um, or pressed and let go by 50 um, readings of 20 nm made errors of 24 and 27 %
+    in what turns over 6 um by the filter's velocity, of 4 and 10 % by smoothed ones, and of 0.2 and 0.6 % by this. With
     stops as far apart again reversals come late: a loss came out 2.4 % too small.
     """
     smoothed_m = np.asarray(savgol_filter(read_m, _QUIET_WINDOW, _ORDER))
