@@ -45,12 +45,12 @@ class Motion:
     at_samples: np.ndarray  # position, velocity, acceleration foretold for the samples themselves, shape (n, 3)
     known_m: np.ndarray  # position with the samples, shape (n,)
     sds_m: np.ndarray  # how well it is known before the samples and with them, shape (n, 2)
-    smoothed_m_per_s: np.ndarray  # of samples on both sides, beyond their noise, shape (n, PARTS_COUNT)
+    carried_m_per_s: np.ndarray  # of samples on both sides, beyond their noise, shape (n, PARTS_COUNT)
 
     @property
     def quiet_m_per_s(self) -> np.ndarray:
         """Velocity for what adds up its amount, shape (n, PARTS_COUNT): smoothed where it is slow."""
-        return np.where(self.slow[:, None], self.smoothed_m_per_s, self.velocity_m_per_s)
+        return np.where(self.slow[:, None], self.carried_m_per_s, self.velocity_m_per_s)
 
 
 def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motion:
@@ -154,7 +154,7 @@ def motion_under(
     unsure |= np.min(velocity, axis=1) * np.max(velocity, axis=1) <= 0.0  # where it turns round within the interval
     slow = rough.slow | (np.convolve(unsure, np.ones(3), "same") > 0.5)
     sds_m = np.sqrt(np.maximum(variances_m2, 0.0))
-    return Motion(position, velocity, acceleration, slow, at_samples, known[:, 0], sds_m, rough.smoothed_m_per_s)
+    return Motion(position, velocity, acceleration, slow, at_samples, known[:, 0], sds_m, rough.carried_m_per_s)
 
 
 @functools.lru_cache(maxsize=_KEPT_COUNT)
