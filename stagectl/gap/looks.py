@@ -368,8 +368,8 @@ def _told_at_size(look: Look, unsettled: Sequence[Recording], crew: Crew) -> Loo
     What moves readings puts the joint elsewhere, which its column says nothing of: a scale error of 0.19 % was worth 3
     squares more than the spring of 1.1 N/m that there was, and put the joint 109 um and 12 000 squares off. What was
     chosen beside it is to be found anew. What would not have stayed in its place is none of them: a rise that a
-    sub-linear friction is inexact by gained 400 squares where a lag of the sensor gained 240. Noise and samples that only
-    one of them tells of may both favour a wrong one: of a gap 4.5 um wider than stated a soft contact left 11 squares
+    sub-linear friction is inexact by gained 400 squares where a lag of the sensor gained 240. Noise and samples that
+    one alone tells of may both favour a wrong one: of a gap 4.5 um wider than stated a soft contact left 11 squares
     less (1010218).
     """
     search, judge = look.search, look.search.judge
