@@ -520,6 +520,18 @@ def test_a_scale_error_of_tens_of_micrometres_is_one_of_either_sensor(touching, 
     assert evidence.distances(signal)["scale_error", "macro_sensor"] < 0.05 * whole
 
 
+def test_the_same_law_at_the_other_sensor_is_asked_at_its_own_size(touching, monkeypatch):
+    """From the few sizes that are tried one of 1690 ppm seemed 450 deviations from one of the other sensor."""
+    law = laws.BY_NAME["scale_error"]
+    error = draw.Effect(law, "macro_sensor", {"relative": 1690e-6})
+    evidence = detection.Evidence(touching, draw.simulate(touching, []), 150.0)
+    signal = evidence.whitened([evidence.law_channels(run, law, "macro_sensor", error.values) for run in evidence.runs])
+    monkeypatch.setattr(detection.laws, "LIBRARY", [law])
+    whole = math.sqrt(evidence.inner(signal, signal))
+    assert evidence.distances(signal)["scale_error", "end_sensor"] > 0.5 * whole
+    assert evidence.distances(signal, [error])["scale_error", "end_sensor"] < 0.05 * whole
+
+
 def test_the_same_law_at_the_other_sensor_is_asked_at_its_own_shape(touching, monkeypatch):
     """Between the 20 s and 77 s of the grid a drift over 36 s seemed 3.7 deviations from one of the other sensor."""
     law = laws.BY_NAME["thermal_drift"]
