@@ -320,19 +320,36 @@ def test_an_edge_is_looked_for_where_no_contact_is_believed_to_be():
     assert found[0].shape["shift_m"] == pytest.approx(-in_m, abs=0.2e-6)
 
 
-def _pressed(apart_m: float, out_m: float, seed: int) -> Log:
-    """Both bodies swing, apart by up to so much at 2 Hz; the right edge lies further out than is believed."""
+def test_a_scale_error_is_looked_for_where_it_hides_every_contact():
+    """Bodies that press by 20 um are read 10 um short of the edge: a drift and a cable were named (1010273)."""
+    apart_m, error = 50e-6, 1500e-6
+    log = _pressed(apart_m, 0.0, 8, W)  # in step with the way
+    read = dataclasses.replace(log, macro_position_m=log.macro_position_m * (1.0 - error))
+    refiner, evidence = _beside_known(balance.recording_of(read, STAGE))
+    assert not np.any(evidence.recordings[0].side)
+    scale = hypotheses.term_of(CATALOGUE["scale_error"], "macro_sensor", {})
+    assert counts_at_size(evidence, scale)
+    assert refiner.gain_at_size(scale) > 1000.0
+    found = refiner.refined(scale)
+    assert found is not None
+    assert found[0].shape["error_ppm"] == pytest.approx(-1e6 * error, rel=0.01)
+    wide = dataclasses.replace(STAGE, joint=dataclasses.replace(JOINT, left_m=1e-3, right_m=1e-3))
+    assert not counts_at_size(_beside_known(balance.recording_of(read, wide))[1], scale)
+
+
+def _pressed(apart_m: float, out_m: float, seed: int, turn_rad_per_s: float = 4.0 * np.pi) -> Log:
+    """Both bodies swing, apart by up to so much; the right edge lies further out than is believed."""
     random = np.random.default_rng(seed)
-    middle_m = apart_m * np.sin(4.0 * np.pi * (T_S + 0.5 * H))
-    rate = apart_m * 4.0 * np.pi * np.cos(4.0 * np.pi * (T_S + 0.5 * H))
+    middle_m = apart_m * np.sin(turn_rad_per_s * (T_S + 0.5 * H))
+    rate = apart_m * turn_rad_per_s * np.cos(turn_rad_per_s * (T_S + 0.5 * H))
     depth_m = np.maximum(middle_m - JOINT.right_m - out_m, 0.0)
     press_n = np.maximum(JOINT.right_stiffness_n_per_m * depth_m + 90.0 * rate * (depth_m > 0.0), 0.0)
     between_n = JOINT.spring_n_per_m * middle_m + JOINT.damping_n_s_per_m * rate + press_n  # on the end
     both_n = -MASS_KG * W * W * _swing(T_S + 0.5 * H)
     noise_m = NOISE_M * random.standard_normal((2, COUNT))
-    macro_m = _swing(T_S) + apart_m * np.sin(4.0 * np.pi * T_S) + noise_m[0]
+    macro_m = _swing(T_S) + apart_m * np.sin(turn_rad_per_s * T_S) + noise_m[0]
     return Log(
-        "run", H, macro_m, both_n + between_n - MASS_KG * 16.0 * np.pi**2 * middle_m,
+        "run", H, macro_m, both_n + between_n - MASS_KG * turn_rad_per_s**2 * middle_m,
         np.ones(COUNT, bool), "1", end_position_m=_swing(T_S) + noise_m[1], micro_command_n=both_n - between_n,
     )  # fmt: skip
 
