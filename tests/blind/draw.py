@@ -257,7 +257,7 @@ def are_one(effect, other):
     """Whether two effects may not stand beside each other: they share what is exclusive, or are one law together.
 
     An asymmetric Coulomb friction and a constant force are one of other levels, moving and at rest: motions differ by
-    picometres (rounding).
+    0.05 nm at most, by rounding.
     """
     if exclusive(effect) == exclusive(other):
         return True
