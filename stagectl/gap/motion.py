@@ -7,6 +7,7 @@ Pure.
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.signal import savgol_coeffs, savgol_filter
@@ -120,6 +121,8 @@ squares more of a million samples, two poles at one place 1700 more."""
 _DOUBTS = ((SLOW_FORCE_N, SLOW_CORNER_RAD_PER_S), *((0.05 * 4.0**k, 2.0 * np.pi * 20.0) for k in range(6)))
 """Slow forces (N, corner in rad/s) of which the likeliest stands for what the believed forces lack."""
 
+_LOOSE_N = 4.0
+
 _KEPT_COUNT = 64
 """Filters that are kept, 1 MB for 20 s: two bodies with two payloads in a few lengths of recording."""
 
@@ -136,14 +139,19 @@ def motion_under(
     believed forces can be trusted is what makes the samples likeliest.
     """
     mean_n, early_n = moments(force_n)
-    samples = valid.tobytes()
-    tried = []
-    for doubt in _DOUBTS:
-        gain, variance, spread_m_per_s = _certainty(samples, mass_kg, period_s, sensor_m, *doubt)
-        corner_rad_per_s = doubt[1]
-        outcome = filtered(position_m, valid, mean_n, early_n, gain, variance, mass_kg, period_s, corner_rad_per_s)
-        tried.append((*outcome, spread_m_per_s, np.column_stack([variance - sensor_m**2, gain[:, 0] * sensor_m**2])))
-    known, foretold, _, spread_m_per_s, variances_m2 = min(tried, key=lambda one: one[2])
+
+    def tried(doubt: tuple[float, float], loose: np.ndarray) -> tuple[Any, ...]:
+        gain, variance, spread_m_per_s = _certainty(
+            valid.tobytes(), loose.tobytes(), mass_kg, period_s, sensor_m, *doubt
+        )
+        outcome = filtered(position_m, valid, mean_n, early_n, gain, variance, mass_kg, period_s, doubt[1])
+        known_m2 = np.column_stack([variance - sensor_m**2, gain[:, 0] * sensor_m**2])
+        return *outcome, spread_m_per_s, known_m2, doubt
+
+    steady = min((tried(doubt, np.zeros_like(valid)) for doubt in _DOUBTS), key=lambda one: one[2])
+    known, foretold, _, spread_m_per_s, variances_m2, _ = min(
+        steady, tried(steady[-1], rough.slow), key=lambda one: one[2]
+    )
     step_s = period_s / force_n.shape[1]
     acceleration = (force_n + known[:, 2:]) / mass_kg
     velocity = known[:, 1:2] + step_s * (np.cumsum(acceleration, axis=1) - 0.5 * acceleration)
@@ -159,7 +167,14 @@ def motion_under(
 
 @functools.lru_cache(maxsize=_KEPT_COUNT)
 def _certainty(
-    samples: bytes, mass_kg: float, period_s: float, sensor_m: float, force_n: float, corner_rad_per_s: float
+    samples: bytes,
+    loose: bytes,
+    mass_kg: float,
+    period_s: float,
+    sensor_m: float,
+    force_n: float,
+    corner_rad_per_s: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what a filter knows along samples that are valid or not: the same each time a recording is looked at."""
-    return certainty(np.frombuffer(samples, dtype=bool), mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)
+    valid, slow = (np.frombuffer(flags, dtype=bool) for flags in (samples, loose))
+    return certainty(valid, slow, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, _LOOSE_N)
