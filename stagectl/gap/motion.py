@@ -46,12 +46,19 @@ class Motion:
     at_samples: np.ndarray  # position, velocity, acceleration foretold for the samples themselves, shape (n, 3)
     known_m: np.ndarray  # position with the samples, shape (n,)
     sds_m: np.ndarray  # how well it is known before the samples and with them, shape (n, 2)
-    carried_m_per_s: np.ndarray  # of samples on both sides, beyond their noise, shape (n, PARTS_COUNT)
+    carried_m_per_s: np.ndarray  # of samples on both sides, beyond their noise, shape (n,)
+    put_right_m_per_s: np.ndarray  # by each sample, over the interval that it begins, shape (n,)
 
     @property
     def quiet_m_per_s(self) -> np.ndarray:
-        """Velocity for what adds up its amount, shape (n, PARTS_COUNT): smoothed where it is slow."""
-        return np.where(self.slow[:, None], self.carried_m_per_s, self.velocity_m_per_s)
+        """Velocity for what adds it up, shape (n, PARTS_COUNT): it leads where the body is, and no farther.
+
+        Foretold velocities alone lead away from there by what every sample puts right: bristles of 1 to 4 um, with
+        their law and the machine known exactly, left 75 800, 49 700, 23 000 and 3700 squares (1010219, 1010003,
+        1007004, 1009010) in place of 470, 140, 1300 and 160. Where the stage is slow, its amount counts, too.
+        """
+        along_m_per_s = self.velocity_m_per_s + self.put_right_m_per_s[:, None]
+        return np.where(self.slow[:, None], self.carried_m_per_s[:, None], along_m_per_s)
 
 
 def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motion:
@@ -77,8 +84,9 @@ def motion_of(position_m: np.ndarray, period_s: float, sensor_m: float) -> Motio
         np.convolve(rests, np.ones(2 * _REST_REACH + 1), "same") > 0.5
     )
     sds_m = np.full((x.size, 2), sensor_m)
-    quiet = np.repeat(way_per_s(position_m, _QUIET_STOPS_RATIO * sensor_m, period_s)[:, None], PARTS_COUNT, axis=1)
-    return Motion(position, velocity, acceleration, wide, np.column_stack([x, v, a]), x, sds_m, quiet)
+    carried_m_per_s = way_per_s(position_m, _QUIET_STOPS_RATIO * sensor_m, period_s)
+    at_samples = np.column_stack([x, v, a])
+    return Motion(position, velocity, acceleration, wide, at_samples, x, sds_m, carried_m_per_s, np.zeros(x.size))
 
 
 _QUIET_STOPS_RATIO = 0.25
@@ -162,7 +170,10 @@ def motion_under(
     unsure |= np.min(velocity, axis=1) * np.max(velocity, axis=1) <= 0.0  # where it turns round within the interval
     slow = rough.slow | (np.convolve(unsure, np.ones(3), "same") > 0.5)
     sds_m = np.sqrt(np.maximum(variances_m2, 0.0))
-    return Motion(position, velocity, acceleration, slow, at_samples, known[:, 0], sds_m, rough.carried_m_per_s)
+    put_right_m_per_s = (known[:, 0] - foretold[:, 0]) / period_s
+    return Motion(
+        position, velocity, acceleration, slow, at_samples, known[:, 0], sds_m, rough.carried_m_per_s, put_right_m_per_s
+    )
 
 
 @functools.lru_cache(maxsize=_KEPT_COUNT)
