@@ -5,6 +5,7 @@ import numpy as np
 from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import late_readings
 from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
+from stagectl.gap.jumps import with_jumps
 from stagectl.gap.late_readings import Row, makes_late
 from stagectl.gap.quantities import along_motion, arguments_of, quantities
 from stagectl.gap.reading_errors import SMALL_M, misread, more_contact_n, reading_error_m
@@ -100,9 +101,11 @@ def effect_forces(
     if Trait.SWINGS in effect.traits:
         value = _swung_n(recording, axis, effect, parameters)
     else:
-        value = along_motion(effect, arguments_of(recording, axis, place, effect), parameters)
-    if effect.has_step:
-        _take_reversals(recording, axis, place, effect, parameters, value)
+        arguments = arguments_of(recording, axis, place, effect)
+        value = along_motion(effect, arguments, parameters)
+        if effect.has_step:
+            acceleration = recording.motion(axis).acceleration_m_per_s2
+            value = with_jumps(effect, arguments, acceleration, parameters, value, recording.log.period_s)
     if place == "contact":
         value = _contact_changed(recording, value, whole)
     if place in ("contact", "joint"):
@@ -114,32 +117,6 @@ def effect_forces(
     if axis == "macro" and "micro_motor_force_n" in effect.quantities:
         value = late_readings.felt_n(recording.late, axis, recording.log, value)
     return Forces(macro_n=value) if axis == "macro" else Forces(end_n=value)
-
-
-def _take_reversals(
-    recording: Recording, axis: str, place: str, effect: Effect, parameters: list[float], value: np.ndarray
-) -> None:
-    """Take a law that jumps where a body turns round as its mean over the part of an interval in which it does so.
-
-    At the middle of the part it comes up to 0.13 ms too early or too late.
-    """
-    known = quantities(recording, axis, place)
-    velocity_m_per_s, acceleration = known["velocity_m_per_s"], known["acceleration_m_per_s2"]
-    part_s = recording.log.period_s / value.shape[1]
-    change = 0.5 * acceleration * part_s
-    turns = np.flatnonzero(np.abs(velocity_m_per_s) < np.abs(change))
-    if not turns.size:
-        return
-    here = {name: known[name].ravel()[turns][:, None] for name in effect.quantities}
-    begin = (velocity_m_per_s - change).ravel()[turns]
-    end = (velocity_m_per_s + change).ravel()[turns]
-    before = acceleration.ravel()[np.maximum(turns - 1, 0)]
-    share = np.where(before * begin < 0.0, np.clip(-begin / (before * part_s), 0.0, 1.0), begin / (begin - end))
-    mean = np.zeros(turns.size)
-    for speed, part in ((begin, share), (end, 1.0 - share)):
-        sided = [0.5 * speed[:, None] if name == "velocity_m_per_s" else here[name] for name in effect.quantities]
-        mean += part * along_motion(effect, sided, parameters)[:, 0]
-    value.ravel()[turns] = mean
 
 
 _TINY = 1e-9
