@@ -130,6 +130,9 @@ _DOUBTS = ((SLOW_FORCE_N, SLOW_CORNER_RAD_PER_S), *((0.05 * 4.0**k, 2.0 * np.pi 
 """Slow forces (N, corner in rad/s) of which the likeliest stands for what the believed forces lack."""
 
 _LOOSE_N = 4.0
+"""Force of a stage that is slow, which nobody knows as long as noise decides on the sign of its friction: 10 ms after a
+stop one of 3.6 N pulled the wrong way, and left 10 200 of 13 000 squares (1010222). 1 N is too little there, and by 4 N
+or more twenty sets of other frictions leave the same."""
 
 _KEPT_COUNT = 64
 """Filters that are kept, 1 MB for 20 s: two bodies with two payloads in a few lengths of recording."""
@@ -144,7 +147,7 @@ def motion_under(
     A filter takes the sample that begins an interval and runs the body through it; nothing of a later sample is in it.
     With motion smoothed over all samples every law along it held some of the noise that it was to explain: flexible
     modes gained up to 1200 squares on machines that have none, and the micro's reaction came out 6 % wrong. How far the
-    believed forces can be trusted is what makes the samples likeliest.
+    believed forces can be trusted is what makes the samples likeliest; where the stage is slow, less, or as elsewhere.
     """
     mean_n, early_n = moments(force_n)
 
