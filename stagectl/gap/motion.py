@@ -131,7 +131,7 @@ _DOUBTS = ((SLOW_FORCE_N, SLOW_CORNER_RAD_PER_S), *((0.05 * 4.0**k, 2.0 * np.pi 
 
 _LOOSE_N = 4.0
 """Force of a stage that is slow, which nobody knows as long as noise decides on the sign of its friction: 10 ms after a
-stop one of 3.6 N pulled the wrong way, and left 10 200 of 13 000 squares (1010222). With all known exactly that set left
+stop one of 3.6 N pulled the wrong way, and left 10 200 of 13 000 squares (1010222). With all known exactly that left
 2100 squares without it, 370 with this, and 1600, 5500 and 370 with 1, 20 and 100 N; of 16 sets with one dry friction 15
 left the same within 120."""
 
