@@ -12,9 +12,10 @@ from stagectl.gap.aliases import aliases_of
 from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Serial
 from stagectl.gap.findings import Named
-from stagectl.gap.judge import ALIAS_SHARE, EXACT_RATIO, LEFT_SDS, Judge
+from stagectl.gap.judge import ALIAS_GAIN, ALIAS_SHARE, EXACT_RATIO, LEFT_SDS, Judge
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group
+from stagectl.gap.parts import levelled
 from stagectl.gap.selection import select
 from stagectl.gap.settling import Left
 from tests.driven_axis import AXIS, STEPS, H, axis_under
@@ -22,10 +23,15 @@ from tests.driven_axis import AXIS, STEPS, H, axis_under
 Made = Callable[[float, float, float], float]
 
 
-def _search(made_n: Callable[[], Made]) -> Competition:
-    """Let all hypotheses get ready on two runs; `made_n` makes the motor's force anew for each."""
-    recordings = [balance.recording_of(axis_under(made_n(), seed), AXIS) for seed in (1, 2)]
-    search = Competition(recordings, 2, nulls_count=20, noise=slow_noise(AXIS, recordings[0]))
+def _search(made_n: Callable[[], Made], apart_n: Callable[[], Made] | None = None) -> Competition:
+    """Let all hypotheses get ready on two runs; `made_n` makes the motor's force anew for each.
+
+    apart_n: that of the second run, which no fit sees then.
+    """
+    both = (made_n, apart_n or made_n)
+    recordings = [balance.recording_of(axis_under(one(), seed), AXIS) for seed, one in enumerate(both, start=1)]
+    training_count = 2 if apart_n is None else 1
+    search = Competition(recordings, training_count, nulls_count=20, noise=slow_noise(AXIS, recordings[0]))
     search.judge.calibrate()
     return search
 
@@ -86,6 +92,23 @@ def test_an_offset_and_a_spring_are_one_cable():
     assert [group.key[0] for group in select(search.judge, start)] == ["cable_spring"]
 
 
+def test_two_levels_that_a_rise_stands_on_are_one_level_and_a_push():
+    """Along the motion they are the same, of as many numbers; a level alone is none that was asymmetric."""
+
+    def risen(command_n: float, x: float, v: float) -> float:
+        return command_n - 3.0 * float(np.sign(v)) * (1.0 + 0.8 * float(np.exp(-((v / 0.02) ** 2)))) - 1.2
+
+    search = _search(lambda: risen)
+    levels, rise = (_of_library(search, name) for name in ("asymmetric_coulomb_friction", "stribeck_friction"))
+    (rise,) = search.judge.refine([*search.judge.base, levels], [rise])
+    assert [group.key[0] for group in levelled(search.judge, [rise, levels])] == [
+        "stribeck_friction",
+        "coulomb_friction",
+        "offset",
+    ]
+    assert levelled(search.judge, [levels]) == [levels]
+
+
 def test_a_spring_about_zero_is_no_cable():
     """A cable gains what noise does more: by that, and 0.002 % of what both gain, they are the same."""
     search = _search(_pulled_by(60.0, 0.0))
@@ -119,6 +142,31 @@ def test_frictions_leave_what_smooth_laws_do(made_n):
     assert judge._inexact([found], _of_library(search, "position_dependent_friction")) > 0.9 * EXACT_RATIO * gained
     both = [found, _of_library(search, "coulomb_friction")]  # each explains most of what the other does
     assert judge._inexact(both, _of_library(search, "cubic_stiffness")) < 0.1 * EXACT_RATIO * gained
+
+
+def test_a_dead_band_leaves_what_smooth_laws_do():
+    """By 0.05 % of 11 million squares of a cyclic error a cable of 490 was taken for what that is inexact by."""
+    search = _search(lambda: lambda command_n, x, v: float(np.sign(command_n)) * max(abs(command_n) - 3.0, 0.0))
+    judge = search.judge
+    (found,) = select(judge)
+    assert found.key[0] == "amplifier_dead_band"
+    gained = judge.gain([found]) - judge.gain([])
+    assert judge._inexact([found], _of_library(search, "cubic_stiffness")) < 0.1 * EXACT_RATIO * gained
+
+
+def test_what_gains_more_and_is_spoken_against_is_no_alias():
+    """Iron of the other motor gained 109 squares more than a friction, of what other iron was inexact by (1010103)."""
+
+    def softened(command_n: float, x: float, v: float) -> float:
+        return command_n + 0.3 * (x / 0.1) ** 3
+
+    search = _search(_pulled_by(20.0, 0.0), lambda: softened)
+    judge = search.judge
+    laws = {group.key[0]: group for group in judge.rivals([])}
+    cable, spring = laws["cable_hysteresis"], laws["linear_stiffness"]
+    assert judge.gain([spring]) > judge.gain([cable]) + ALIAS_GAIN
+    assert not judge.stays([], spring)
+    assert "linear_stiffness" not in {key[0] for key, _ in aliases_of(judge, [cable], cable)}
 
 
 def _shaken() -> Made:

@@ -46,7 +46,7 @@ def sensor_lag(velocity_m_per_s, acceleration_m_per_s2, dt_s, time_constant_s, m
 
 @effect(
     places=_SENSORS,
-    error_ppm=(-1000.0, 1000.0),
+    error_ppm=(-1e4, 1e4),
     linear=("error_ppm",),
     shown_by="strokes",
     symptom="proportional to position, on the reading",

@@ -24,6 +24,9 @@ def aliases_of(judge: Judge, chosen: Sequence[Group], group: Group) -> list[tupl
     it was named in. The same law elsewhere does so at the same shape: a drift of the end's sensor over 52 s and one
     of the macro's over 36 s were 10 squares apart, over 52 s both are one. And what is chosen beside them may act about
     another place: beside a cable a tilt of both bodies was an offset of the micro, and 1.1 N of the cable's.
+
+    What gains more and yet does not stay gains what laws beside it are inexact by: iron of the micro's motor 109
+    squares more than the friction that was there, beside 570 million of the macro's (1010103).
     """
     rest = [other for other in chosen if other is not group]
     with_it = judge.gain(chosen)
@@ -44,6 +47,8 @@ def aliases_of(judge: Judge, chosen: Sequence[Group], group: Group) -> list[tupl
         apart = min(distances)
         other = forms[distances.index(apart)]
         margin = with_it - judge.gain([*beside, other])
+        if margin < -ALIAS_GAIN and not judge.stays(beside, other):
+            continue
         share = margin / max(gained, 1e-300)
         inexact = margin < left and share < ALIAS_SHARE and _lies_between(margin, apart)
         if judge.surprise(beside, other) - surprise > ALIAS_GAIN:

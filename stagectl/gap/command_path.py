@@ -8,6 +8,7 @@ memory changes the commands themselves. Means over parts are tilted to what a st
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
@@ -103,32 +104,35 @@ def driven_later(command: np.ndarray, latch_s: float, lag_s: float, period_s: fl
     lag = max(lag_s / period_s, 0.0)
     starts, at_latch = _relaxing(now, before, rest, lag) if lag > 0.0 else (before, now)
     there = np.arange(now.size * PARTS_COUNT + 1) / PARTS_COUNT - late_s / period_s
-    held = starts, before, at_latch, now, rest, lag
-    return with_early(_between(there, *held).reshape(-1, PARTS_COUNT), _early_between(there[::PARTS_COUNT], *held))
+    held = _Held(starts, before, at_latch, now, rest, lag)
+    return with_early(_between(there, held).reshape(-1, PARTS_COUNT), _early_between(there[::PARTS_COUNT], held))
+
+
+class _Held(NamedTuple):
+    """What goes towards the earlier of two held commands, then towards the one that takes over, in every interval."""
+
+    starts: np.ndarray  # value at the sample, shape (n,)
+    before: np.ndarray  # the earlier command, shape (n,)
+    at_latch: np.ndarray  # value where the later one takes over, shape (n,)
+    now: np.ndarray  # the later command, shape (n,)
+    rest: float  # when it takes over, in intervals
+    lag: float  # of the way to each, in intervals
 
 
 @compiled
-def _between(
-    edges: np.ndarray,
-    starts: np.ndarray,
-    before: np.ndarray,
-    at_latch: np.ndarray,
-    now: np.ndarray,
-    rest: float,
-    lag: float,
-) -> np.ndarray:
+def _between(edges: np.ndarray, held: _Held) -> np.ndarray:
     """Return means between edges (in periods) of what relaxes towards held commands; its ends are held."""
-    n = now.size
+    n = held.now.size
     impulse = np.zeros(n + 1)
     for k in range(n):
-        impulse[k + 1] = impulse[k] + _impulse(1.0, starts[k], before[k], at_latch[k], now[k], rest, lag)
+        impulse[k + 1] = impulse[k] + _impulse(1.0, k, held)
     means = np.empty(edges.size - 1)
     earlier = 0.0
     for j in range(edges.size):
         inside = min(max(edges[j], 0.0), float(n))
         k = min(int(inside), n - 1)
-        reached = impulse[k] + _impulse(inside - k, starts[k], before[k], at_latch[k], now[k], rest, lag)
-        reached += (edges[j] - inside) * (starts[0] if edges[j] < inside else now[n - 1])
+        reached = impulse[k] + _impulse(inside - k, k, held)
+        reached += (edges[j] - inside) * (held.starts[0] if edges[j] < inside else held.now[n - 1])
         if j > 0:
             means[j - 1] = (reached - earlier) / (edges[j] - edges[j - 1])
         earlier = reached
@@ -136,52 +140,47 @@ def _between(
 
 
 @compiled
-def _impulse(until: float, start: float, before: float, at_latch: float, now: float, rest: float, lag: float) -> float:
-    """Integrate one interval of it from its sample on."""
-    early, late = min(until, rest), max(until - rest, 0.0)
+def _impulse(until: float, k: int, held: _Held) -> float:
+    """Integrate it over one interval, from its sample on."""
+    before, now, lag = held.before[k], held.now[k], held.lag
+    early, late = min(until, held.rest), max(until - held.rest, 0.0)
     total = before * early + now * late
     if lag > 0.0:
-        total -= (start - before) * lag * np.expm1(-early / lag) + (at_latch - now) * lag * np.expm1(-late / lag)
+        total -= (held.starts[k] - before) * lag * np.expm1(-early / lag)
+        total -= (held.at_latch[k] - now) * lag * np.expm1(-late / lag)
     return total
 
 
 @compiled
-def _early_between(
-    edges: np.ndarray,
-    starts: np.ndarray,
-    before: np.ndarray,
-    at_latch: np.ndarray,
-    now: np.ndarray,
-    rest: float,
-    lag: float,
-) -> np.ndarray:
+def _early_between(edges: np.ndarray, held: _Held) -> np.ndarray:
     """Return means that are weighted towards the start between edges (in periods) of the same."""
-    n = now.size
+    n = held.now.size
     early = np.empty(edges.size - 1)
     for j in range(early.size):
         begin, end = edges[j], edges[j + 1]
-        total = starts[0] * (end - 0.5 * (begin + min(end, 0.0))) * (min(end, 0.0) - begin) if begin < 0.0 else 0.0
-        total += 0.5 * now[n - 1] * (end - max(begin, float(n))) ** 2 if end > n else 0.0
+        ahead = min(end, 0.0)
+        total = held.starts[0] * (end - 0.5 * (begin + ahead)) * (ahead - begin) if begin < 0.0 else 0.0
+        total += 0.5 * held.now[n - 1] * (end - max(begin, float(n))) ** 2 if end > n else 0.0
         inside, until = min(max(begin, 0.0), float(n)), min(max(end, 0.0), float(n))
         for k in range(int(inside), min(int(until), n - 1) + 1):
             low, high = max(inside - k, 0.0), min(until - k, 1.0)
-            goes = starts[k], before[k], at_latch[k], now[k], rest, lag
-            at_low = _impulse(low, *goes)
-            total += (end - k - high) * (_impulse(high, *goes) - at_low)
-            total += _twice(high, *goes) - _twice(low, *goes) - (high - low) * at_low
+            at_low = _impulse(low, k, held)
+            total += (end - k - high) * (_impulse(high, k, held) - at_low)
+            total += _twice(high, k, held) - _twice(low, k, held) - (high - low) * at_low
         early[j] = 2.0 * total / (end - begin) ** 2
     return early
 
 
 @compiled
-def _twice(until: float, start: float, before: float, at_latch: float, now: float, rest: float, lag: float) -> float:
-    """Integrate one interval of it twice, from its sample on."""
-    early, late = min(until, rest), max(until - rest, 0.0)
+def _twice(until: float, k: int, held: _Held) -> float:
+    """Integrate it twice over one interval, from its sample on."""
+    before, now, lag = held.before[k], held.now[k], held.lag
+    early, late = min(until, held.rest), max(until - held.rest, 0.0)
     total = before * early * (until - 0.5 * early) + 0.5 * now * late**2
     if lag > 0.0:
         faded = np.expm1(-early / lag)
-        total += (start - before) * lag * (early - (until - early - lag) * faded)
-        total += (at_latch - now) * lag * (late + lag * np.expm1(-late / lag))
+        total += (held.starts[k] - before) * lag * (early - (until - early - lag) * faded)
+        total += (held.at_latch[k] - now) * lag * (late + lag * np.expm1(-late / lag))
     return total
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import late_readings
 from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
+from stagectl.gap.jumps import with_jumps
 from stagectl.gap.late_readings import Row, makes_late
 from stagectl.gap.quantities import along_motion, arguments_of, quantities
 from stagectl.gap.reading_errors import SMALL_M, misread, more_contact_n, reading_error_m
@@ -100,7 +101,11 @@ def effect_forces(
     if Trait.SWINGS in effect.traits:
         value = _swung_n(recording, axis, effect, parameters)
     else:
-        value = along_motion(effect, arguments_of(recording, axis, place, effect), parameters)
+        arguments = arguments_of(recording, axis, place, effect)
+        value = along_motion(effect, arguments, parameters)
+        if effect.has_step:
+            acceleration = recording.motion(axis).acceleration_m_per_s2
+            value = with_jumps(effect, arguments, acceleration, parameters, value, recording.log.period_s)
     if place == "contact":
         value = _contact_changed(recording, value, whole)
     if place in ("contact", "joint"):

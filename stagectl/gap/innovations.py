@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stagectl.compiled import compiled
+from stagectl.compiled import compiled, inlined
 from stagectl.gap.interval_parts import PARTS_COUNT, moments_of
 
 _START_SD = (1e-6, 1e-2)  # of position and velocity before the first sample, m and m/s
@@ -62,6 +62,16 @@ def _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
     return a, drive, p
 
 
+@inlined
+def _let_loose(p, acceleration_m_per_s2, period_s):
+    """Add to a covariance what a force that is held over one interval, and that nobody knows, moves in it."""
+    q, h = acceleration_m_per_s2 * acceleration_m_per_s2, period_s
+    p[0, 0] += 0.25 * q * h**4
+    p[0, 1] += 0.5 * q * h**3
+    p[1, 0] = p[0, 1]
+    p[1, 1] += q * h * h
+
+
 @compiled
 def gains(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, white_force_n, loose_force_n):
     """Return (gains (n, 4), innovation variances (n,)); `loose` intervals feel an unknown force of `loose_force_n`."""
@@ -93,11 +103,7 @@ def gains(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, 
                     total += half[i, c] * a[j, c]
                 p[i, j] = total
         white = white_force_n + (loose_force_n if loose[k] else 0.0)
-        q = (white / mass_kg) ** 2
-        p[0, 0] += 0.25 * q * h**4
-        p[0, 1] += 0.5 * q * h**3
-        p[1, 0] = p[0, 1]
-        p[1, 1] += q * h * h
+        _let_loose(p, white / mass_kg, h)
     return gain, variance
 
 
@@ -163,12 +169,13 @@ def is_nothing(values: np.ndarray) -> bool:
 
 
 @compiled
-def certainty(valid, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
+def certainty(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, loose_force_n):
     """Return (gains (n, 4), innovation variances (n,), standard deviations of the known velocity, m/s, (n,)).
 
     What a filter knows depends on which samples are valid, and on nothing that they hold.
     """
     n = valid.size
+    h = period_s
     a, drive, p = _model(mass_kg, period_s, sensor_m, force_n, corner_rad_per_s)
     gains_here, variances, spread_m_per_s = np.zeros((n, _STATES)), np.zeros(n), np.zeros(n)
     for k in range(n):
@@ -181,6 +188,8 @@ def certainty(valid, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s):
         spread_m_per_s[k] = np.sqrt(p[1, 1])
         p = a @ p @ a.T + drive
         p = 0.5 * (p + p.T)
+        if loose[k]:
+            _let_loose(p, loose_force_n / mass_kg, h)
     return gains_here, variances, spread_m_per_s
 
 

@@ -50,6 +50,12 @@ def is_friction(group: Group) -> bool:
     return known is not None and not known.origin and (known.has_step or shows_at_low_speed(group))
 
 
+def is_off_joint(group: Group) -> bool:
+    """Tell whether a law of the library, none of a user's own, acts away from the joint."""
+    known = CATALOGUE.get(group.key[0])
+    return known is not None and not known.origin and group.key[1] not in ("contact", "joint")
+
+
 def act_apart(one: Group, other: Group) -> bool:
     """Tell whether two laws push different bodies, of which no motor pushes the other one back.
 

@@ -82,6 +82,38 @@ def in_parts(judge: Judge, chosen: Sequence[Group]) -> list[Group]:
     return found
 
 
+def levelled(judge: Judge, chosen: Sequence[Group]) -> list[Group]:
+    """Return two levels that a rise towards standstill stands on as one level and a push that can't be told from them.
+
+    Along the motion they are one and the same, of as many numbers; which a search meets first is chance, and a rise is
+    stated above one level (1010006: a tilt of 27 deviations beside a Stribeck friction was an asymmetry of its level).
+    """
+    found = list(chosen)
+    for group in chosen:
+        place = group.key[1]
+        if group.key[0] != "asymmetric_coulomb_friction" or ("stribeck_friction", place) not in {g.key for g in found}:
+            continue
+        rest = [other for other in found if other is not group]
+        taken = {other.key for other in rest}
+        levels, pushes = (
+            [
+                other
+                for other in judge.library
+                if other.key[1] == place and other.key[0] in names and other.key not in taken
+            ]
+            for names in (("coulomb_friction",), ("offset", "gravity_tilt"))
+        )
+        parts = [[level, push] for level, push in itertools.product(levels, pushes)]
+        if not parts:
+            continue
+        best = max(parts, key=lambda two: round(judge.worth([*rest, *two]), 3))  # the first of those that are the same
+        as_good = judge.worth([*rest, *best]) > judge.worth(found) - _excused_of_parts(judge, found, group)
+        if as_good and judge.allows([*rest, *best]):
+            at = found.index(group)
+            found = [*found[:at], *best, *found[at + 1 :]]
+    return found
+
+
 def _two_like(judge: Judge, rest: Sequence[Group], group: Group) -> list[Group]:
     """Return the two frictions of the same body, of fewer numbers in all, that gain most, at their best shapes.
 

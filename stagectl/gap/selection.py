@@ -7,7 +7,7 @@ from stagectl.gap.findings import PARAMETER
 from stagectl.gap.judge import ALIAS_GAIN, ALIAS_SHARE, CURVE_GAIN, EXACT_RATIO, MATERIAL_RATIO, SMOOTH_RATIO, Judge
 from stagectl.gap.kinds import form, has_akin, is_smooth
 from stagectl.gap.normal_equations import Group
-from stagectl.gap.parts import as_one, in_parts
+from stagectl.gap.parts import as_one, in_parts, levelled
 
 NAMES_BESIDE_CURVE_COUNT = 3
 """From so many names on a curve that explains more than any further name ends the search: it is unknown. To six names
@@ -44,7 +44,7 @@ def select(
         if state in seen or any(until(group) for group in chosen) or judge.has_named_noise(chosen):
             break
         seen.add(state)
-    return as_one(judge, in_parts(judge, _beside_other_shapes(judge, chosen)))
+    return levelled(judge, as_one(judge, in_parts(judge, _beside_other_shapes(judge, chosen))))
 
 
 def _beside_other_shapes(judge: Judge, chosen: list[Group]) -> list[Group]:
