@@ -56,3 +56,13 @@ def test_a_body_that_does_not_turn_round_feels_what_it_did():
     velocity, acceleration = _turned(-5.0 * PART_S, 0.7, 0.7)
     there_n = along_motion(friction, [velocity], [LEVEL_N, 1e-9])
     assert np.array_equal(with_jumps(friction, [velocity], acceleration, [LEVEL_N, 1e-9], there_n, H), there_n)
+
+
+def test_a_body_that_begins_to_move_turns_where_its_part_says():
+    """Nothing slowed it down before: warnings are errors."""
+    friction = CATALOGUE["coulomb_friction"]
+    velocity, acceleration = np.full((1, PARTS), -1e-9), np.array([[0.0, 1.0, 1.0, 1.0]])
+    there_n = along_motion(friction, [velocity], [LEVEL_N, 1e-12])
+    found_n = with_jumps(friction, [velocity], acceleration, [LEVEL_N, 1e-12], there_n, H)
+    assert found_n[0, 0] == there_n[0, 0]
+    assert np.all(np.abs(found_n[0, 1:]) < 1e-3 * LEVEL_N)  # as long to one side as to the other

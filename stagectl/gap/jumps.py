@@ -34,7 +34,8 @@ def with_jumps(
     change = part_s * acceleration[turns]
     begin, end = middle[turns] - 0.5 * change, middle[turns] + 0.5 * change
     before = part_s * acceleration[np.maximum(turns - 1, 0)]
-    share = np.where(before * begin < 0.0, np.minimum(-begin / before, 1.0), begin / (begin - end))
+    share, slows = begin / (begin - end), before * begin < 0.0
+    share[slows] = np.minimum(-begin[slows] / before[slows], 1.0)
     mean_n = np.zeros(turns.size)
     for speed_m_per_s, lasts in ((0.5 * begin, share), (0.5 * end, 1.0 - share)):
         there = [
