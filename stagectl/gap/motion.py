@@ -54,8 +54,8 @@ class Motion:
         """Velocity for what adds it up, shape (n, PARTS_COUNT): it leads where the body is, and no farther.
 
         Foretold velocities alone lead away from there by what every sample puts right: bristles of 1 to 4 um, with
-        their law and the machine known exactly, left 75 800, 49 700, 23 000 and 3700 squares (1010219, 1010003,
-        1007004, 1009010) in place of 470, 140, 1300 and 160. Where the stage is slow, its amount counts, too.
+        their law and the machine known exactly, left 73 900, 49 800, 23 000 and 3700 squares (1010219, 1010003,
+        1007004, 1009010) in place of 400, 140, 1300 and 160. Where the stage is slow, its amount counts, too.
         """
         along_m_per_s = self.velocity_m_per_s + self.put_right_m_per_s[:, None]
         return np.where(self.slow[:, None], self.carried_m_per_s[:, None], along_m_per_s)
