@@ -1,10 +1,12 @@
 """Laws that jump where a body turns round: as means over the parts of intervals in which it does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from stagectl.effects import CATALOGUE
-from stagectl.gap.jumps import with_jumps
+from stagectl.gap.jumps import jumps_at, with_jumps
 from stagectl.gap.quantities import along_motion
 
 H, PARTS, LEVEL_N = 1e-3, 4, 3.0
@@ -66,3 +68,13 @@ def test_a_body_that_begins_to_move_turns_where_its_part_says():
     found_n = with_jumps(friction, [velocity], acceleration, [LEVEL_N, 1e-12], there_n, H)
     assert found_n[0, 0] == there_n[0, 0]
     assert np.all(np.abs(found_n[0, 1:]) < 1e-3 * LEVEL_N)  # as long to one side as to the other
+
+
+def test_a_law_of_a_user_may_jump_with_something_else():
+    """With how fast the joint closes, or with a memory: either has no velocity of one body to turn round with."""
+    friction = CATALOGUE["coulomb_friction"]
+    assert jumps_at(friction, "macro_force")
+    assert not jumps_at(friction, "joint")
+    assert not jumps_at(replace(friction, quantities=("relative_velocity_m_per_s",)), "macro_force")
+    assert not jumps_at(replace(friction, memory=1), "macro_force")
+    assert not jumps_at(CATALOGUE["viscous_friction"], "macro_force")

@@ -341,13 +341,8 @@ def test_an_edge_is_looked_for_where_no_contact_is_believed_to_be():
     """The right edge lies 14 um further in, and is reached from there: no column knows of it, and no shift moved it."""
     in_m = 14e-6
     refiner, evidence = _beside_known(balance.recording_of(_pressed(25e-6, -in_m, 8), STAGE))
-    assert not np.any(evidence.recordings[0].side)
     shift = hypotheses.term_of(CATALOGUE["backlash_centre_shift"], "contact_edge", {})
-    assert counts_at_size(evidence, shift)
-    assert refiner.gain_at_size(shift) > 1000.0
-    found = refiner.refined(shift)
-    assert found is not None
-    assert found[0].shape["shift_m"] == pytest.approx(-in_m, abs=0.2e-6)
+    assert _unseen(refiner, evidence, shift).shape["shift_m"] == pytest.approx(-in_m, abs=0.2e-6)
 
 
 def test_a_scale_error_is_looked_for_where_it_hides_every_contact():
@@ -356,15 +351,20 @@ def test_a_scale_error_is_looked_for_where_it_hides_every_contact():
     log = _pressed(apart_m, 0.0, 8, W)  # in step with the way
     read = dataclasses.replace(log, macro_position_m=log.macro_position_m * (1.0 - error))
     refiner, evidence = _beside_known(balance.recording_of(read, STAGE))
-    assert not np.any(evidence.recordings[0].side)
     scale = hypotheses.term_of(CATALOGUE["scale_error"], "macro_sensor", {})
-    assert counts_at_size(evidence, scale)
-    assert refiner.gain_at_size(scale) > 1000.0
-    found = refiner.refined(scale)
-    assert found is not None
-    assert found[0].shape["error_ppm"] == pytest.approx(-1e6 * error, rel=0.01)
+    assert _unseen(refiner, evidence, scale).shape["error_ppm"] == pytest.approx(-1e6 * error, rel=0.01)
     wide = dataclasses.replace(STAGE, joint=dataclasses.replace(JOINT, left_m=1e-3, right_m=1e-3))
     assert not counts_at_size(_beside_known(balance.recording_of(read, wide))[1], scale)
+
+
+def _unseen(refiner: Refiner, evidence: Evidence, term: hypotheses.Term) -> hypotheses.Term:
+    """Return what is found of a law that moves contacts where none is believed to be."""
+    assert not np.any(evidence.recordings[0].side)
+    assert counts_at_size(evidence, term)
+    assert refiner.gain_at_size(term) > 1000.0
+    found = refiner.refined(term)
+    assert found is not None
+    return found[0]
 
 
 def _pressed(apart_m: float, out_m: float, seed: int, turn_rad_per_s: float = 4.0 * np.pi) -> Log:

@@ -5,7 +5,7 @@ import numpy as np
 from stagectl.effects import CATALOGUE, Effect, Trait
 from stagectl.gap import late_readings
 from stagectl.gap.forces import Forces, add_forces, scaled_forces, sum_of_forces
-from stagectl.gap.jumps import with_jumps
+from stagectl.gap.jumps import jumps_at, with_jumps
 from stagectl.gap.late_readings import Row, makes_late
 from stagectl.gap.quantities import along_motion, arguments_of, quantities
 from stagectl.gap.reading_errors import SMALL_M, misread, more_contact_n, reading_error_m
@@ -103,7 +103,7 @@ def effect_forces(
     else:
         arguments = arguments_of(recording, axis, place, effect)
         value = along_motion(effect, arguments, parameters)
-        if effect.has_step:
+        if jumps_at(effect, place):
             acceleration = recording.motion(axis).acceleration_m_per_s2
             value = with_jumps(effect, arguments, acceleration, parameters, value, recording.log.period_s)
     if place == "contact":

@@ -172,7 +172,8 @@ def is_nothing(values: np.ndarray) -> bool:
 def certainty(valid, loose, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, loose_force_n):
     """Return (gains (n, 4), innovation variances (n,), standard deviations of the known velocity, m/s, (n,)).
 
-    What a filter knows depends on which samples are valid, and on nothing that they hold.
+    What a filter knows depends on which samples are valid and which intervals `loose`, as in `gains`, and on nothing
+    that samples hold.
     """
     n = valid.size
     h = period_s

@@ -15,6 +15,11 @@ from stagectl.gap.quantities import along_motion
 _VELOCITY = "velocity_m_per_s"
 
 
+def jumps_at(effect: Effect, place: str) -> bool:
+    """Tell whether a law without memory jumps with the velocity of the body that it pushes; a user's own may not."""
+    return effect.has_step and not effect.memory and _VELOCITY in effect.quantities and place.endswith("_force")
+
+
 def with_jumps(
     effect: Effect,
     arguments: Sequence[np.ndarray],
@@ -23,7 +28,7 @@ def with_jumps(
     force_n: np.ndarray,
     period_s: float,
 ) -> np.ndarray:
-    """Return forces of a law without memory, shape (n, parts), as means where the velocity changes its sign.
+    """Return forces of a law that jumps, shape (n, parts), as means where the velocity changes its sign.
 
     arguments: what the law asks for, in its order, and force_n what it is there, at the middles of parts. A body goes
     on into its reversal as before it: behind it, what jumps acts already.

@@ -190,6 +190,6 @@ def _certainty(
     force_n: float,
     corner_rad_per_s: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what a filter knows along samples that are valid or not: the same each time a recording is looked at."""
+    """Return what a filter knows along samples that are valid or not, and where a stage is slow: often the same."""
     valid, slow = (np.frombuffer(flags, dtype=bool) for flags in (samples, loose))
     return certainty(valid, slow, mass_kg, period_s, sensor_m, force_n, corner_rad_per_s, _LOOSE_N)
