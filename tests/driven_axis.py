@@ -13,8 +13,12 @@ DURATION_S = 8.0
 AXIS = Believed("an axis", H, BelievedAxis(MASS, 0.2, NOISE_M, 0.0, force_constant_sd_ratio=0.005, latch_sd_s=5e-6))
 
 
-def axis_under(made_n: Callable[[float, float, float], float], seed: int) -> Log:
-    """Run an axis in closed loop, its motor's force made by `made_n` of command, position and velocity."""
+def axis_under(made_n: Callable[[float, float, float], float], seed: int, steps: int = STEPS) -> Log:
+    """Run an axis in closed loop, its motor's force made by `made_n` of command, position and velocity.
+
+    steps: in a sample interval. What a friction does where the axis turns round takes more than ten: beside 6.5 million
+    squares of a sub-linear one a ripple gained 47 with ten of them, and 0 with 200.
+    """
     random = np.random.default_rng(seed)
     count = round(DURATION_S / H)
     t = np.arange(count) * H
@@ -25,11 +29,11 @@ def axis_under(made_n: Callable[[float, float, float], float], seed: int) -> Log
     noise = NOISE_M * random.standard_normal(count)
     x, v = float(goal[0]), float(rate[0])
     seen, command = np.zeros(count), np.zeros(count)
-    h = H / STEPS
+    h = H / steps
     for k in range(count):
         seen[k] = x + noise[k]
         command[k] = MASS * (pull[k] + 900.0 * (goal[k] - seen[k]) + 42.0 * (rate[k] - v))
-        for _ in range(STEPS):
+        for _ in range(steps):
             x += 0.5 * h * v
             v += h * made_n(command[k], x, v) / MASS
             x += 0.5 * h * v

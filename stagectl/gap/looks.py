@@ -548,6 +548,7 @@ def _under(
         crew=crew,
     )
     search.judge.threshold, search.judge.trace = first.judge.threshold, first.judge.trace
+    search.judge.is_closer = True
     if motion.moved:  # in units of this noise: of a clock of 495 million squares the look before knew 1.5 million
         search.judge.at_size = max(excess(belief_under(first, search, crew), []), 0.0)
     return search
