@@ -16,7 +16,7 @@ from stagectl.gap.judge import ALIAS_GAIN, ALIAS_SHARE, EXACT_RATIO, LEFT_SDS, J
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group
 from stagectl.gap.parts import levelled
-from stagectl.gap.selection import select
+from stagectl.gap.selection import MOST_NAMES_COUNT, select
 from stagectl.gap.settling import Left
 from tests.driven_axis import AXIS, STEPS, H, axis_under
 
@@ -165,6 +165,18 @@ def test_laws_are_more_exact_along_the_motion_under_them():
         inexact = judge._inexact([friction], _of_library(competition, "linear_stiffness"))
         shares.append(inexact / (judge.gain([friction]) - judge.gain([])))
     assert shares[1] < 0.2 * shares[0]
+
+
+@pytest.mark.parametrize(("force_n", "is_unknown"), [(0.5, True), (0.0, False)])
+def test_a_look_with_more_names_than_may_stand_is_the_last_where_something_is_left(force_n, is_unknown):
+    """In the place of a base that shakes ten names stood at their sizes, and four looks took twenty minutes."""
+    search = _search(lambda: lambda command_n, x, v: command_n - force_n * float(np.sin(1e3 * x * abs(x) ** 0.5)))
+    case = looks._Case(search, search.evidence.recordings, frozenset(), Serial())
+    late = (CATALOGUE["sensor_delay"], "macro_sensor", {"delay_s": 1e-4})
+    search.moved = MOST_NAMES_COUNT * (late,)
+    assert not looks._is_unknown(case, looks.Look(search, [], ()))
+    search.moved += (late,)
+    assert looks._is_unknown(case, looks.Look(search, [], ())) == is_unknown
 
 
 def test_what_gains_more_and_is_spoken_against_is_no_alias():

@@ -27,7 +27,7 @@ from stagectl.gap.noise import noise_of
 from stagectl.gap.normal_equations import Group, Solution, solve
 from stagectl.gap.operating_point import Moved
 from stagectl.gap.recording import Recording
-from stagectl.gap.selection import lacks_a_name, select
+from stagectl.gap.selection import MOST_NAMES_COUNT, lacks_a_name, select
 from stagectl.gap.settling import (
     Left,
     belief_under,
@@ -198,13 +198,15 @@ def _taken(case: _Case, course: _Course) -> tuple[Look, tuple[Named, ...]]:
 
 
 def _is_unknown(case: _Case, look: Look) -> bool:
-    """Tell whether what is left lacks a name, with the joint in its place."""
-    search = look.search
-    return (
-        lacks_a_name(search.judge, look.chosen)
-        and not any(moves_joint(search, group) for group in look.chosen)
-        and unknown_rest(search, look.chosen, excess(belief_under(case.first, search, case.crew), [])) is not None
-    )
+    """Tell whether what is left lacks a name, with the joint in its place.
+
+    Or has more of them than a competition lets stand, in all: in the place of a base that shakes, two dead bands, two
+    late sensors and a late drive stood at their sizes, five more beside them, and each look had found others.
+    """
+    search, chosen = look.search, look.chosen
+    lacks = lacks_a_name(search.judge, chosen) and not any(moves_joint(search, group) for group in chosen)
+    lacks = lacks or len(chosen) + len(search.moved) > MOST_NAMES_COUNT
+    return lacks and unknown_rest(search, chosen, excess(belief_under(case.first, search, case.crew), [])) is not None
 
 
 _Told = tuple[Look, _Course | None]

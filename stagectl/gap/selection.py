@@ -13,12 +13,18 @@ NAMES_BESIDE_CURVE_COUNT = 3
 """From so many names on a curve that explains more than any further name ends the search: it is unknown. To six names
 and back, each competing beside the others again, took a force that no effect is a quarter of an hour or more."""
 
+MOST_NAMES_COUNT = 6
+"""So many names a competition lets stand: a machine that has more of them has an effect that nobody has a law for."""
+
 _HOPEFUL_SHARE = 0.3
 """Of what a name gains, what another gains at least that may be it once the shapes beside it are its own."""
 
 
 def select(
-    judge: Judge, start: Sequence[Group] = (), most: int = 6, until: Callable[[Group], bool] = lambda group: False
+    judge: Judge,
+    start: Sequence[Group] = (),
+    most: int = MOST_NAMES_COUNT,
+    until: Callable[[Group], bool] = lambda group: False,
 ) -> list[Group]:
     """Add the best hypothesis as long as one stays; then let every one compete again beside the others.
 
