@@ -17,7 +17,7 @@ def axis_under(made_n: Callable[[float, float, float], float], seed: int, steps:
     """Run an axis in closed loop, its motor's force made by `made_n` of command, position and velocity.
 
     steps: in a sample interval. What a friction does where the axis turns round takes more than ten: beside 6.5 million
-    squares of a sub-linear one a ripple gained 47 with ten of them, and 0 with 200.
+    squares of a sub-linear one a ripple gained 47 with ten of them, and 2 with 100.
     """
     random = np.random.default_rng(seed)
     count = round(DURATION_S / H)
