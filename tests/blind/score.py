@@ -87,23 +87,31 @@ def matched(findings, members, judged_aliases=True):
 
 
 def _respelled(findings, members):
-    """Findings with asymmetric Coulomb friction spelled as the truth has it: exactly Coulomb friction and an offset."""
+    """Findings with asymmetric Coulomb friction spelled as the truth has it: exactly Coulomb friction and an offset.
+
+    An offset is also what the truth holds to be one: a tilt that nobody can tell from it.
+    """
     result = list(findings)
     present = {(member["name"], member["acts_on"]) for member in members}
     for axis in ("macro_force", "micro_force"):
         one = [found for found in result if (found["name"], found["acts_on"]) == ("asymmetric_coulomb_friction", axis)]
-        two = [
-            found for found in result if found["name"] in ("coulomb_friction", "offset") and found["acts_on"] == axis
-        ]
-        if one and {("coulomb_friction", axis), ("offset", axis)} <= present:
+        friction = [found for found in result if (found["name"], found["acts_on"]) == ("coulomb_friction", axis)]
+        constant = [found for found in result if found not in friction and ("offset", axis) in _names(found)]
+        others = [member for member in members if (member["name"], member["acts_on"]) != ("coulomb_friction", axis)]
+        stands_for = next((member for member in others if _may_be(member, "offset", axis)), None)
+        if one and ("coulomb_friction", axis) in present and stands_for:
             result.remove(one[0])
-            result += [_respelled_as(name, axis) for name in ("coulomb_friction", "offset")]
-        elif {found["name"] for found in two} == {"coulomb_friction", "offset"} and (
-            ("asymmetric_coulomb_friction", axis) in present
-        ):
-            result = [found for found in result if not any(found is other for other in two)]
+            result.append(_respelled_as("coulomb_friction", axis))
+            result.append(_respelled_as(stands_for["name"], stands_for["acts_on"]))
+        elif friction and constant and ("asymmetric_coulomb_friction", axis) in present:
+            result = [found for found in result if found is not friction[0] and found is not constant[0]]
             result.append(_respelled_as("asymmetric_coulomb_friction", axis))
     return result
+
+
+def _may_be(member, name, axis):
+    """Whether a true effect is a law, or one that nobody can tell from it."""
+    return (name, axis) in {(member["name"], member["acts_on"]), *(tuple(key) for key in member["inseparable"])}
 
 
 def _respelled_as(name, axis):
