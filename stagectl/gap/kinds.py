@@ -50,6 +50,11 @@ def is_friction(group: Group) -> bool:
     return known is not None and not known.origin and (known.has_step or shows_at_low_speed(group))
 
 
+def is_dry(group: Group) -> bool:
+    """Tell whether a law of the library holds a body by what rubs on it: a friction, or a cable that slips."""
+    return is_friction(group) or group.key[0] == "cable_hysteresis"
+
+
 def is_off_joint(group: Group) -> bool:
     """Tell whether a law of the library, none of a user's own, acts away from the joint."""
     known = CATALOGUE.get(group.key[0])

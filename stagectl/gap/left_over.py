@@ -9,6 +9,7 @@ from stagectl.effects import CATALOGUE
 from stagectl.gap.competition import Competition
 from stagectl.gap.curves import unit_of
 from stagectl.gap.judge import ALIAS_GAIN, CURVE_GAIN, MATERIAL_RATIO, Judge
+from stagectl.gap.kinds import is_dry
 from stagectl.gap.normal_equations import Fold, Group, solve
 
 _LEFT_SDS = 4.0
@@ -51,6 +52,10 @@ _CROWD_COUNT = 3
 """So many names on one body that a single curve does as well as are one effect that has no name: a spring with a dead
 zone came out as a spring, a cable that slips, a cogging as long as the travel and an offset, 4 squares of 107 000
 better than a curve over position."""
+
+_MOST_DRY_COUNT = 3
+"""Laws that rub on one body at most: what takes four of them is one that has no name. A friction that grows with the
+time since each reversal was a level, a rise, a sub-linear friction and a slipping cable, and left nothing (1011107)."""
 
 
 def excess(judge: Judge, chosen: list[Group]) -> float:
@@ -97,13 +102,19 @@ def unknown_rest(
         loudest = _LOUDEST_RATIO * sum(s.count for s in search.evidence.sums)
         floor = min(floor, _LEFT_SDS * noise + loudest)
     least = max(CURVE_GAIN * judge.threshold, curve_share * max(first, 0.0))
-    if not left > floor and not gained > least:
+    if not (left > floor or gained > least or _rubs_too_often(chosen)):
         finer = finer_curve(search, chosen, finer_share * max(first, 0.0))
         if finer is None:
             return None
         if finer.key not in {curve.key for curve in search.curves}:  # of place there is a coarse one, as tables are
             best, gained = finer, judge.gain([*chosen, finer]) - judge.gain(chosen)
     return _curve_found(search, chosen, best, left, first, gained)
+
+
+def _rubs_too_often(chosen: list[Group]) -> bool:
+    """Tell whether more laws rub on one body than there are on any."""
+    places = [group.key[1] for group in chosen if is_dry(group)]
+    return any(places.count(place) > _MOST_DRY_COUNT for place in places)
 
 
 def are_exact(search: Competition, chosen: list[Group]) -> bool:
