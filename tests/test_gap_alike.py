@@ -13,9 +13,10 @@ from stagectl.gap.competition import Competition
 from stagectl.gap.crew import Serial
 from stagectl.gap.findings import Named
 from stagectl.gap.judge import ALIAS_GAIN, ALIAS_SHARE, EXACT_RATIO, LEFT_SDS, Judge
+from stagectl.gap.left_over import excess, unknown_rest
 from stagectl.gap.noise import slow_noise
 from stagectl.gap.normal_equations import Group
-from stagectl.gap.parts import levelled
+from stagectl.gap.parts import as_two_others, levelled
 from stagectl.gap.selection import MOST_NAMES_COUNT, select
 from stagectl.gap.settling import Left
 from tests.driven_axis import AXIS, STEPS, H, axis_under
@@ -109,6 +110,17 @@ def test_two_levels_that_a_rise_stands_on_are_one_level_and_a_push():
     assert levelled(search.judge, [levels]) == [levels]
 
 
+def test_a_push_and_a_cable_are_an_offset_and_a_spring():
+    """The same forces with a number more; what only a cable does beside another law stays one."""
+    search = _search(_pulled_by(60.0, -3.0))
+    two = [_of_library(search, name) for name in ("cable_spring", "gravity_tilt")]
+    assert sorted(group.key[0] for group in as_two_others(search.judge, two)) == ["linear_stiffness", "offset"]
+    search = _search(lambda: lambda command_n, x, v: command_n - 60.0 * (x - 0.25) - 8.0 * v)
+    two = [_of_library(search, name) for name in ("cable_spring", "viscous_friction")]
+    two = search.judge.reshaped(two)
+    assert as_two_others(search.judge, two) == two
+
+
 def test_a_spring_about_zero_is_no_cable():
     """A cable gains what noise does more: by that, and 0.002 % of what both gain, they are the same."""
     search = _search(_pulled_by(60.0, 0.0))
@@ -177,6 +189,15 @@ def test_a_look_with_more_names_than_may_stand_is_the_last_where_something_is_le
     assert not looks._is_unknown(case, looks.Look(search, [], ()))
     search.moved += (late,)
     assert looks._is_unknown(case, looks.Look(search, [], ())) == is_unknown
+
+
+def test_what_takes_more_than_three_laws_that_rub_has_no_name():
+    """A friction that grows with the time since each reversal was four of them, and left nothing (1011107)."""
+    search = _search(lambda: lambda command_n, x, v: command_n - 3.0 * float(np.sign(v)), steps=100)
+    names = ("coulomb_friction", "stribeck_friction", "dahl_friction", "cable_hysteresis")
+    *three, fourth = (_of_library(search, name) for name in names)
+    assert unknown_rest(search, three, excess(search.judge, [])) is None
+    assert unknown_rest(search, [*three, fourth], excess(search.judge, [])) is not None
 
 
 def test_what_gains_more_and_is_spoken_against_is_no_alias():

@@ -33,6 +33,7 @@ from stagectl.gap.settling import remeasured
 from stagectl.gap.workflow import find
 from stagectl.row import new_rows
 from tests.blind import draw, generate, laws
+from tests.blind.machine import B
 
 H, MASS = 1e-3, 40.0
 
@@ -664,6 +665,23 @@ def test_hidden_dry_friction_is_named_and_nothing_where_nothing_is_missing(frict
     sd = findings.refitted_sds["macro_mass_kg"]
     assert 0.0 < sd < 0.01
     assert findings.refitted["macro_mass_kg"] == pytest.approx(-0.005, abs=3.0 * sd)
+
+
+@pytest.mark.parametrize(("seed", "ratio"), [(3622, 0.955), (3198, 1.045)])
+def test_two_known_parameters_are_more_to_be_believed_than_one_that_is_stated_exactly(seed, ratio, tmp_path):
+    """A reaction of the micro's motor that is off by that gains as much alone, and was told instead (1011144)."""
+    case = generate.draw(seed, "null", 6.0)
+    assert case.belief["micro_reaction"] > 0.0
+    case.runs = [run for run in case.runs if run.recipe in ("trapezoid", "micrometre_reversals", "slow_speeds")][:2]
+    for name in ("micro_mass_kg", "micro_force_constant_n_per_a"):
+        case.base[B[name]] *= ratio
+    case.runs = draw.simulate(case)
+    generate.write(case, tmp_path)
+    blind = load_set(tmp_path)
+    recordings = [balance.recording_of(log, blind.believed) for log in blind.logs]
+    search = Competition(recordings, len(recordings), nulls_count=20, noise=noise_of(recordings))
+    search.judge.calibrate()
+    assert {group.key[0] for group in select(search.judge)} == {"micro_mass_kg", "micro_force_constant"}
 
 
 LEAST_SQUARES = 500.0

@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Sequence
 
 from stagectl.gap.judge import ALIAS_GAIN, Judge
-from stagectl.gap.kinds import form, shows_at_low_speed
+from stagectl.gap.kinds import form, is_smooth, shows_at_low_speed
 from stagectl.gap.normal_equations import Fold, Group
 
 _HOPEFUL_SHARE = 0.9
@@ -111,6 +111,27 @@ def levelled(judge: Judge, chosen: Sequence[Group]) -> list[Group]:
         if as_good and judge.allows([*rest, *best]):
             at = found.index(group)
             found = [*found[:at], *best, *found[at + 1 :]]
+    return found
+
+
+def as_two_others(judge: Judge, chosen: Sequence[Group]) -> list[Group]:
+    """Return two smooth laws as two others, of one number each, that can't be told from them.
+
+    A tilt and a cable of the macro are a spring of it and an offset of the micro: the same forces, with a number more,
+    and no round in which one name takes another's place comes by (1011134).
+    """
+    found = list(chosen)
+    for two in itertools.combinations(chosen, 2):
+        if not all(one in found and is_smooth(one) for one in two) or sum(one.complexity for one in two) <= 2:
+            continue
+        rest = [group for group in found if group not in two]
+        taken = {group.key for group in found}
+        others = [group for group in judge.library if is_smooth(group) and group.complexity == 1]
+        pairs = itertools.combinations([group for group in others if group.key not in taken], 2)
+        best = max(pairs, key=lambda pair: judge.gain([*rest, *pair]), default=())
+        as_good = judge.gain([*rest, *best]) > judge.gain(found) - ALIAS_GAIN
+        if as_good and judge.allows([*rest, *best]):
+            found = [*best, *rest]
     return found
 
 
