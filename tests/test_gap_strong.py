@@ -16,6 +16,7 @@ from stagectl.gap.crew import Serial
 from stagectl.gap.curvature import at_best_shapes
 from stagectl.gap.evidence import Evidence
 from stagectl.gap.findings import SIGMAS
+from stagectl.gap.forces import Forces, scaled_forces
 from stagectl.gap.known_motion import moved_under
 from stagectl.gap.log import Log
 from stagectl.gap.looks import Look
@@ -60,6 +61,25 @@ def test_a_ripple_of_the_force_constant_stands_out_in_step_with_the_motor():
     driven = seeds.pitches_m(recordings, "macro", seeds.in_step_with_motor(recordings, "macro", signals))
     assert driven[0] == pytest.approx(PITCH_M, rel=0.01)
     assert abs(seeds.pitches_m(recordings, "macro", signals)[0] / PITCH_M - 1.0) > 0.05
+
+
+def test_what_pushes_nobody_explains_nothing_and_spoils_nothing():
+    """A column of zeros was weighed by its own size: 0 where it divides."""
+    recording = _recordings()[0]
+    balance.set_noise(recording, slow_noise(AXIS, recording))
+    terms, rests = hypotheses.parameter_terms(recording), []
+    of_mass = terms[0][0].forces
+    idle = replace(
+        terms[0][0],
+        amplitudes=("mass", "nothing"),
+        forces=lambda recording: [*of_mass(recording), scaled_forces(*of_mass(recording), 0.0, Forces())],
+    )
+    sds = [sd for _, sd in terms]
+    for added, added_sds in ([], []), ([idle], [1e-13, 1e-13]):
+        evidence = Evidence([recording])
+        evidence.add_all([*(term for term, _ in terms), *added])
+        rests.append(evidence.rest(0, 0, np.array(sds + added_sds)))
+    assert np.abs(rests[1] - rests[0]).max() < 1e-9 * np.abs(rests[0]).max()
 
 
 def test_a_pitch_of_few_periods_stands_out_of_noise_where_it_does_not_of_its_neighbours():

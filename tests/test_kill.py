@@ -113,7 +113,7 @@ class Witness:
         assert abs(moved_m) < STANDSTILL_M
 
     def has_no_power(self) -> None:
-        """Let the frames of a motion come late; no drive may have power, or get it, and the macro's motor pushes nobody.
+        """Let the frames of a motion come late; no drive may have power, or get it, and the macro's motor pushes not.
 
         How fast the macro coasts says little: cogging of 3 N makes up to 25 mm/s of it. The micro's winding is shorted.
         """

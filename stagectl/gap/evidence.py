@@ -195,7 +195,7 @@ class Evidence:
         """
         one = self.channels[recording][channel]
         z = one.rows[0]
-        used = [k for k, number in enumerate(one.numbers) if 0 < number <= prior_sds.size]
+        used = [k for k, number in enumerate(one.numbers) if 0 < number <= prior_sds.size and one.rows[k].any()]
         if not used:
             return z
         rows = np.stack([one.rows[k] for k in used])
