@@ -93,6 +93,19 @@ def test_a_stage_that_stood_is_not_thought_to_be_driven_by_its_own_noise():
     assert np.max(np.abs(motion.velocity_m_per_s[behind, 0] - speed)) < 60e-6
 
 
+def test_a_stage_that_creeps_turns_round_nowhere():
+    """A push that is wrong by 8 N for a millisecond throws what is foretold back: friction is unknown there."""
+    random, noise_m = np.random.default_rng(5), 1e-9
+    seen_m = 30e-6 * T_S + noise_m * random.standard_normal(COUNT)
+    wrong_n = np.zeros((COUNT, 4))
+    wrong_n[500::200] = -8.0
+    motion = motion_under(motion_of(seen_m, H, noise_m), seen_m, np.ones(COUNT, bool), wrong_n, MASS_KG, H, noise_m)
+    thrown_back = np.any(motion.velocity_m_per_s < 0.0, axis=1)
+    assert np.count_nonzero(thrown_back) > 18
+    assert np.all(motion.slow[thrown_back])
+    assert np.count_nonzero(motion.slow) < 0.2 * COUNT
+
+
 LATE = {
     "sensor_delay": {"delay_s": 3e-3},
     "sensor_lag": {"time_constant_s": 3e-3},
