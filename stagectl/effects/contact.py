@@ -7,6 +7,7 @@ by its own.
 import numpy as np
 
 from stagectl.effects.declaration import Trait, effect
+from stagectl.effects.elementary import fading
 
 
 @effect(
@@ -79,7 +80,7 @@ def contact_hysteresis(
         return 0.0
     before = memory[0]
     goal = 0.0 if penetration_velocity_m_per_s >= 0.0 else 2.0
-    memory[0] = goal + (before - goal) * np.exp(-abs(penetration_velocity_m_per_s) * dt_s / turn_m)
+    memory[0] = goal + (before - goal) * fading(abs(penetration_velocity_m_per_s) * dt_s / turn_m)
     return loss_ratio * contact_stiffness_n_per_m * penetration_m * (1.0 - 0.5 * (before + memory[0]))
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from stagectl.effects.declaration import effect
+from stagectl.effects.elementary import fading
 
 _AXES = ("macro_force", "micro_force")
 _SMOOTHING = (1e-7, 1e-1)  # m/s
@@ -149,7 +150,7 @@ def dahl_friction(velocity_m_per_s, dt_s, level_n, slip_m, memory):
     """
     z = memory[0]
     side = 1.0 if velocity_m_per_s >= 0.0 else -1.0
-    memory[0] = side + (z - side) * np.exp(-abs(velocity_m_per_s) * dt_s / slip_m)
+    memory[0] = side + (z - side) * fading(abs(velocity_m_per_s) * dt_s / slip_m)
     return -0.5 * level_n * (z + memory[0])
 
 
@@ -175,8 +176,8 @@ def lugre_friction(velocity_m_per_s, dt_s, level_n, static_ratio, stribeck_m_per
     """
     z = memory[0]
     ratio = velocity_m_per_s / stribeck_m_per_s
-    g = 1.0 + (static_ratio - 1.0) * np.exp(-ratio * ratio)
+    g = 1.0 + (static_ratio - 1.0) * fading(ratio * ratio)
     goal = g if velocity_m_per_s >= 0.0 else -g
-    memory[0] = goal + (z - goal) * np.exp(-abs(velocity_m_per_s) * dt_s / (slip_m * g))
+    memory[0] = goal + (z - goal) * fading(abs(velocity_m_per_s) * dt_s / (slip_m * g))
     rate_per_s = (velocity_m_per_s - abs(velocity_m_per_s) * z / g) / slip_m if dt_s <= 0.0 else (memory[0] - z) / dt_s
     return -level_n * (0.5 * (z + memory[0]) + bristle_damping_s * rate_per_s)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from stagectl.effects.declaration import effect
+from stagectl.effects.elementary import wave
 
 _AXES = ("macro_force", "micro_force")
 _PITCH = (1e-4, 1.0)  # m
@@ -42,7 +43,7 @@ def cogging(position_m, amplitude_n, pitch_m, phase_rad):
 def harmonic_cogging(position_m, first_n, second_n, pitch_m, first_phase_rad, second_phase_rad):
     """Cogging with its second harmonic: F = A_1 sin(2 pi x / p + phi_1) + A_2 sin(4 pi x / p + phi_2)."""
     angle = 2.0 * np.pi * position_m / pitch_m
-    return first_n * np.sin(angle + first_phase_rad) + second_n * np.sin(2.0 * angle + second_phase_rad)
+    return wave(first_n, angle + first_phase_rad) + wave(second_n, 2.0 * angle + second_phase_rad)
 
 
 @effect(

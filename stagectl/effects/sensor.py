@@ -3,6 +3,7 @@
 import numpy as np
 
 from stagectl.effects.declaration import Trait, effect
+from stagectl.effects.elementary import wave
 
 _SENSORS = ("macro_sensor", "end_sensor")
 _PHASE = (-7.0, 7.0)  # rad
@@ -74,7 +75,7 @@ def scale_error(position_m, error_ppm):
 def cyclic_error(position_m, first_m, second_m, wavelength_m, first_phase_rad, second_phase_rad):
     """Periodic error of the interferometer: A_1 sin(4 pi x / lambda + phi_1) + A_2 sin(8 pi x / lambda + phi_2)."""
     angle = 4.0 * np.pi * position_m / wavelength_m
-    return first_m * np.sin(angle + first_phase_rad) + second_m * np.sin(2.0 * angle + second_phase_rad)
+    return wave(first_m, angle + first_phase_rad) + wave(second_m, 2.0 * angle + second_phase_rad)
 
 
 @effect(

@@ -3,6 +3,7 @@
 import numpy as np
 
 from stagectl.effects.declaration import Trait, effect
+from stagectl.effects.elementary import power_of_rest
 
 _AXES = ("macro_force", "micro_force")
 _GRAVITY_M_PER_S2 = 9.80665  # standard gravity, ISO 80000-3
@@ -73,8 +74,8 @@ def cable_hysteresis(velocity_m_per_s, dt_s, level_n, slip_m, exponent_ratio, me
     z = memory[0]
     side = 1.0 if velocity_m_per_s >= 0.0 else -1.0
     power = 1.0 - exponent_ratio
-    left = np.power(max(1.0 - side * z, 0.0), power) - power * abs(velocity_m_per_s) * dt_s / slip_m
-    memory[0] = side * (1.0 - np.power(max(left, 0.0), 1.0 / power))
+    left = power_of_rest(1.0 - side * z, power) - power * abs(velocity_m_per_s) * dt_s / slip_m
+    memory[0] = side * (1.0 - power_of_rest(left, 1.0 / power))
     return -0.5 * level_n * (z + memory[0])
 
 

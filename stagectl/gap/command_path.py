@@ -14,7 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from stagectl import compose
-from stagectl.compiled import compiled
+from stagectl.compiled import compiled, inlined
 from stagectl.effects import CATALOGUE, Effect
 from stagectl.gap.interval_parts import PARTS_COUNT, with_early
 
@@ -125,13 +125,13 @@ def _between(edges: np.ndarray, held: _Held) -> np.ndarray:
     n = held.now.size
     impulse = np.zeros(n + 1)
     for k in range(n):
-        impulse[k + 1] = impulse[k] + _impulse(1.0, k, held)
+        impulse[k + 1] = impulse[k] + _impulses(1.0, k, held)[0]
     means = np.empty(edges.size - 1)
     earlier = 0.0
     for j in range(edges.size):
         inside = min(max(edges[j], 0.0), float(n))
         k = min(int(inside), n - 1)
-        reached = impulse[k] + _impulse(inside - k, k, held)
+        reached = impulse[k] + _impulses(inside - k, k, held)[0]
         reached += (edges[j] - inside) * (held.starts[0] if edges[j] < inside else held.now[n - 1])
         if j > 0:
             means[j - 1] = (reached - earlier) / (edges[j] - edges[j - 1])
@@ -139,16 +139,21 @@ def _between(edges: np.ndarray, held: _Held) -> np.ndarray:
     return means
 
 
-@compiled
-def _impulse(until: float, k: int, held: _Held) -> float:
-    """Integrate it over one interval, from its sample on."""
+@inlined
+def _impulses(until: float, k: int, held: _Held) -> tuple[float, float]:
+    """Integrate it over one interval, from its sample on: once, and twice."""
     before, now, lag = held.before[k], held.now[k], held.lag
     early, late = min(until, held.rest), max(until - held.rest, 0.0)
-    total = before * early + now * late
+    once = before * early + now * late
+    twice = before * early * (until - 0.5 * early) + 0.5 * now * late**2
     if lag > 0.0:
-        total -= (held.starts[k] - before) * lag * np.expm1(-early / lag)
-        total -= (held.at_latch[k] - now) * lag * np.expm1(-late / lag)
-    return total
+        way, faded = (held.starts[k] - before) * lag, np.expm1(-early / lag)
+        once -= way * faded
+        twice += way * (early - (until - early - lag) * faded)
+        way, faded = (held.at_latch[k] - now) * lag, np.expm1(-late / lag)
+        once -= way * faded
+        twice += way * (late + lag * faded)
+    return once, twice
 
 
 @compiled
@@ -164,24 +169,11 @@ def _early_between(edges: np.ndarray, held: _Held) -> np.ndarray:
         inside, until = min(max(begin, 0.0), float(n)), min(max(end, 0.0), float(n))
         for k in range(int(inside), min(int(until), n - 1) + 1):
             low, high = max(inside - k, 0.0), min(until - k, 1.0)
-            at_low = _impulse(low, k, held)
-            total += (end - k - high) * (_impulse(high, k, held) - at_low)
-            total += _twice(high, k, held) - _twice(low, k, held) - (high - low) * at_low
+            (at_low, twice_at_low), (at_high, twice_at_high) = _impulses(low, k, held), _impulses(high, k, held)
+            total += (end - k - high) * (at_high - at_low)
+            total += twice_at_high - twice_at_low - (high - low) * at_low
         early[j] = 2.0 * total / (end - begin) ** 2
     return early
-
-
-@compiled
-def _twice(until: float, k: int, held: _Held) -> float:
-    """Integrate it twice over one interval, from its sample on."""
-    before, now, lag = held.before[k], held.now[k], held.lag
-    early, late = min(until, held.rest), max(until - held.rest, 0.0)
-    total = before * early * (until - 0.5 * early) + 0.5 * now * late**2
-    if lag > 0.0:
-        faded = np.expm1(-early / lag)
-        total += (held.starts[k] - before) * lag * (early - (until - early - lag) * faded)
-        total += (held.at_latch[k] - now) * lag * (late + lag * np.expm1(-late / lag))
-    return total
 
 
 def at_delays(made: Callable[[float], np.ndarray], latch_s: float, late_s: np.ndarray, period_s: float) -> np.ndarray:
@@ -302,7 +294,7 @@ def _run(effect: Effect, parameters: list[float], command: np.ndarray, lag_s: fl
     times_s = (np.arange(command.size) * dt_s).reshape(command.shape)
     known = {"command_a": command, "t_s": times_s, "dt_s": np.full(command.shape, dt_s)}
     known["current_loop_s"] = np.full(command.shape, lag_s)
-    columns = np.stack([known[name].ravel() for name in effect.quantities]).T
+    columns = tuple(np.require(known[name], np.float64, ["C", "W"]).ravel() for name in effect.quantities)
     out = compose.along_one_machine(effect)(columns, np.array([*parameters, 0.0]), np.zeros(max(effect.memory, 1)))
     return np.asarray(out).reshape(command.shape)
 

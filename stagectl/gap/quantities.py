@@ -163,8 +163,7 @@ def _at_samples(fine: np.ndarray) -> np.ndarray:
 
 def along_motion(effect: Effect, arguments: list[np.ndarray], parameters: list[float]) -> np.ndarray:
     """Run a law in time order over arrays of its quantities, all of shape (n, parts); shape kept."""
-    flat = [values.ravel() for values in arguments]
-    columns = flat[0][:, None] if len(flat) == 1 else np.stack(flat).T  # one quantity after the other: copied whole
+    columns = tuple(np.require(values, np.float64, ["C", "W"]).ravel() for values in arguments)
     memory = np.zeros(max(effect.memory, 1))
     out = compose.along_one_machine(effect)(columns, np.array([*parameters, 0.0]), memory)
     return np.asarray(out).reshape(arguments[0].shape)
